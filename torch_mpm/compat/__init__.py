@@ -4,6 +4,6 @@
 - `torch_mpm.compat.nclaw`: simulator and laws of NCLaw.
 - `torch_mpm.compat.mpm_pytorch`: `MPMSolver`, constitutive models and boundary conditions of MPM-PyTorch.
 
-Names of arguments, units and the order of operations are those of the other simulator; names in CamelCase are theirs.
-docs/migrating tells what differs.
+Names of arguments, units and the order of operations are those of the other simulator, as are names in CamelCase.
+docs/migrating lists the differences.
 """

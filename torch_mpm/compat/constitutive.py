@@ -1,6 +1,7 @@
-"""Stresses and return maps that NCLaw and MPM-PyTorch have in common, by the compiled laws where there is one.
+"""Stresses and return maps common to NCLaw and MPM-PyTorch, by compiled laws where available.
 
-All take F [P, 3, 3] and moduli μ, λ [Pa] as tensors [1] or [P]; gradients pass to all of them, also at equal stretches.
+Arguments are F [P, 3, 3] and moduli μ, λ [Pa] as tensors [1] or [P]; gradients pass to all of them, also at equal
+stretches.
 """
 
 from __future__ import annotations
@@ -54,14 +55,14 @@ def von_mises(F: Tensor, mu: Tensor, limit: Tensor) -> Tensor:
 
 
 def drucker_prager(F: Tensor, mu: Tensor, lam: Tensor, friction_angle: Tensor, cohesion: Tensor) -> Tensor:
-    """F on the cone of a friction angle [degrees], with its apex at the strain `cohesion` on every axis."""
+    """F on the cone of a friction angle [degrees], with its apex at the strain `cohesion` along every axis."""
     slope = friction_alpha(torch.deg2rad(friction_angle.to(F)), 3)
     parameters = [mu.to(F), lam.to(F), slope, cohesion.to(F), torch.zeros_like(slope)]
     return law_update("sand_hencky", F, parameters).state
 
 
 def isochoric_reset(F: Tensor, lowest: float = 0.0, highest: float = math.inf) -> Tensor:
-    """J^(1/3) 1 with J between two bounds: what a fluid keeps of F."""
+    """J^(1/3) 1 with J between two bounds: F of a fluid after flow."""
     J = torch.linalg.det(F).clamp(lowest, highest)
     return J.pow(1 / 3)[:, None, None] * identity(F)
 

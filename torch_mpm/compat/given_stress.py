@@ -1,4 +1,4 @@
-"""Steps whose stress comes from outside, as in simulators that are called with it."""
+"""Steps with an external stress, for simulators that are called with it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..step import Step
 
 
 class GivenStress(Material):
-    """A law that returns the stress that it was given last."""
+    """Law that returns the stress that was set last."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -32,7 +32,7 @@ def stepped(
     step: Step, x: Tensor, v: Tensor, C: Tensor, F: Tensor, stress: Tensor, mass: Tensor, volume: Tensor, time: float,
     dt: float,
 ) -> State:  # fmt: skip
-    """The state after a step of a `GivenStress`.
+    """State after a step of a `GivenStress`.
 
     Raises:
         TypeError, ValueError: for wrong shapes, dtypes or devices.

@@ -1,4 +1,4 @@
-"""Arguments that may require grad: they keep their gradient, or are refused by name."""
+"""Arguments that may require grad: their gradient is preserved, or they are refused by name."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def refuse_grad(reason: str, **arguments: Any) -> None:
     """Check that no argument requires grad.
 
     Raises:
-        ValueError: with the name of an argument, and why it has no gradient.
+        ValueError: with the name of an argument, and the reason why it has no gradient.
     """
     for name, value in arguments.items():
         if requires_grad(value):
@@ -36,7 +36,7 @@ def vector(name: str, value: Any, like: Tensor) -> tuple[float, ...] | Tensor:
     """Three numbers, or a tensor [3] in the dtype and on the device of another tensor where one requires grad.
 
     Raises:
-        TypeError, ValueError: for anything else.
+        TypeError, ValueError: for other arguments.
     """
     if not requires_grad(value):
         single = isinstance(value, (list, tuple))

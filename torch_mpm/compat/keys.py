@@ -13,10 +13,10 @@ def check_keys(
     """Check that all keys are known.
 
     Args:
-        what: the dictionary in words.
+        what: description of the dictionary.
         given: its keys.
-        known: keys that it may have.
-        unsupported: keys of related simulators, with what to do instead.
+        known: allowed keys.
+        unsupported: keys of related simulators, with their replacement.
 
     Raises:
         ValueError: for other keys, with the nearest known one of each.

@@ -13,9 +13,9 @@ from .gradients import Numbers
 
 
 def surface_margin(dtype: torch.dtype, extent: float) -> float:
-    """Distance [m] by which a surface is moved, so that nodes on it are outside, where the others compare with <.
+    """Displacement [m] of a surface, so that nodes on it are outside, where the other simulators compare with <.
 
-    An `Obstacle` counts nodes within 16 roundings of the largest coordinate as inside.
+    An `Obstacle` treats nodes within 16 roundings of the largest coordinate as inside.
     """
     return 64 * torch.finfo(dtype).eps * extent
 
@@ -23,7 +23,7 @@ def surface_margin(dtype: torch.dtype, extent: float) -> float:
 def stopping_plane(
     point: Numbers, normal: Numbers, margin: float, start: float, end: float, kind: str = "sticky"
 ) -> Plane:
-    """Acts on the nodes behind a plane, but for those within a margin [m] behind it."""
+    """Acts on the nodes behind a plane, except those within a margin [m] behind it."""
     size = math.sqrt(sum(n * n for n in normal))
     if not 0 < size < math.inf:
         raise ValueError(f"normal must have a positive length, got {list(normal)}")
@@ -39,8 +39,9 @@ def moving_cuboid(
     start: float,
     end: float,
 ) -> Obstacle:
-    """Gives its velocity to the nodes inside, and moves with it from `start` on; those within a margin [m] of its faces
-    are outside."""
+    """Sets its velocity on the nodes inside, and moves with it from `start` on; nodes within a margin [m] of its faces
+    are outside.
+    """
     size = [2 * (float(h) - margin) for h in half]
     if min(size) <= 0:
         raise ValueError(f"size must be more than {margin:.3g} m on every axis, got {list(half)}")
@@ -81,11 +82,11 @@ class FreezeOutside(nn.Module):
         self.start, self.end, self.steps = float(start), float(end), steps
 
     def acts_within(self, first: float, last: float, dt: float) -> bool:
-        """Whether it does anything at a time from `first` to `last`."""
+        """Whether it is active at a time from `first` to `last`."""
         return first < self.start or (last >= self.end and first < self.end + self.steps * dt)
 
     def forward(self, velocity: Tensor, positions: Tensor, scene: Tensor | None, time: float, dt: float) -> Tensor:
         stopped = (time < self.start) | ((time >= self.end) & (time < self.end + self.steps * dt))
-        if isinstance(stopped, Tensor):  # of a step in a graph
+        if isinstance(stopped, Tensor):  # Of a step in a graph.
             return torch.where(stopped, 0, velocity)
         return torch.zeros_like(velocity) if stopped else velocity

@@ -1,4 +1,4 @@
-"""Which particles PhysGaussian and MPM-PyTorch select, and how they turn them."""
+"""Selection of particles by PhysGaussian and MPM-PyTorch, and their rotation."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from .gradients import Numbers
 
 
 class Rotation(Timed):
-    """Turns particles about an axis n through a point and moves them along it: v = ω (x − p) × n + s n.
+    """Rotates particles about an axis n through a point and moves them along it: v = ω (x − p) × n + s n.
 
     Args:
-        point, normal: of the axis: three numbers, or tensors [3] that may require grad.
+        point, normal: point and direction of the axis: three numbers, or tensors [3] that may require grad.
         rotation: ω [rad/s], about −n: a number, or a tensor [] that may require grad.
         translation: s [m/s], likewise.
         start, end, particles: see `Timed`.
@@ -49,7 +49,7 @@ class Rotation(Timed):
 
 
 def in_box(x: Tensor, point: Numbers, size: Numbers) -> Tensor:
-    """Which positions are in a box of half edges `size` about a point, bool [P]."""
+    """Whether positions are in a box of half edges `size` about a point, bool [P]."""
     centre, half = small_vector(point, x.device).to(x.dtype), small_vector(size, x.device).to(x.dtype)
     return ((x.detach() - centre).abs() < half).all(1)
 
@@ -60,7 +60,7 @@ def in_cylinder(
     normal: Numbers,
     half_height_and_radius: Numbers,
 ) -> Tensor:
-    """Which positions are in a cylinder, bool [P]."""
+    """Whether positions are in a cylinder, bool [P]."""
     offset = x.detach() - small_vector(point, x.device).detach().to(x.dtype)
     direction = small_vector(normal, x.device).detach()
     axis = (direction / direction.norm()).to(x.dtype)
@@ -71,7 +71,7 @@ def in_cylinder(
 
 
 def small_vector(v: Numbers, device: torch.device) -> Tensor:
-    """Numbers on a device, float64; a tensor keeps its gradient."""
+    """Numbers on a device, float64; gradients of a tensor are preserved."""
     if isinstance(v, Tensor):
         return v.to(device, torch.float64)
     return torch.tensor([float(a) for a in v], dtype=torch.float64, device=device)

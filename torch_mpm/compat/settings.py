@@ -1,4 +1,4 @@
-"""Configurations: objects with attributes, as those of OmegaConf, or mappings."""
+"""Configurations: objects with attributes, such as those of OmegaConf, or mappings."""
 
 from __future__ import annotations
 

@@ -17,19 +17,19 @@ DPI = 100
 
 
 def figure(resolution: tuple[int, int]) -> Any:
-    """A matplotlib figure of that many pixels, drawn by Agg: no screen, no pyplot, no global state."""
+    """A matplotlib figure of a size in pixels, drawn by Agg: no screen, no pyplot, no global state."""
     new = require("matplotlib.figure").Figure(figsize=(resolution[0] / DPI, resolution[1] / DPI), dpi=DPI)
     require("matplotlib.backends.backend_agg").FigureCanvasAgg(new)
     return new
 
 
 def font_size(resolution: tuple[int, int]) -> float:
-    """Points: text keeps its share of the picture down to what can be read."""
+    """Font size in points: text has a fixed share of the picture, with a readable minimum."""
     return max(12.0 * min(resolution[1] / 720, resolution[0] / 1000), 7.0)
 
 
 def scale_width(resolution: tuple[int, int]) -> float:
-    """Share of the width that a colour bar with its numbers and label takes."""
+    """Share of the width of a colour bar with its numbers and label."""
     return 7.2 * font_size(resolution) * DPI / 72 / resolution[0]
 
 

@@ -1,4 +1,4 @@
-"""From the simulation's obstacles at a time to the shapes that are drawn."""
+"""Shapes to draw for the obstacles of a simulation at a time."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .requires import require
 from .shapes import GREY, Shape
 
 LEVEL_CELLS = 96
-"""Cells along the longest side of the domain, by which a shape is drawn that is only known by its distance."""
+"""Number of cells along the longest side of the domain for shapes that are only known by their distance."""
 
 
 def obstacle_shapes(
@@ -26,7 +26,7 @@ def obstacle_shapes(
 ) -> list[Shape]:
     """Shapes of a `torch_mpm.boundaries.Obstacle` at `time` [s] in scene `scene`: empty while it does not act.
 
-    What is infinite is cut off at the domain `bounds` (lower [D], upper [D]).
+    Infinite shapes are clipped to the domain `bounds` (lower [D], upper [D]).
     """
     lower, upper = (np.asarray(b, dtype=np.float64) for b in bounds)
     absent = not obstacle.start <= time < obstacle.end or obstacle.scene not in (None, scene)
@@ -49,7 +49,7 @@ def _of_scene(value: Any, rank: int, scene: int) -> Array:
 
 
 def _zero_level(shape: Any, lower: Array, upper: Array, at: Array, turn: Array) -> list[SurfaceMesh]:
-    """Where the distance of a shape at a pose is zero, in world coordinates."""
+    """Zero level of the distance of a shape at a pose, in world coordinates."""
     torch = require("torch")
     step = float(np.max(upper - lower)) / LEVEL_CELLS
     axes = [np.arange(a - 2 * step, b + 2.5 * step, step) for a, b in zip(lower, upper, strict=True)]

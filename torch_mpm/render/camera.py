@@ -17,7 +17,7 @@ class Camera:
     right: Array
     up: Array
     forward: Array
-    view_angle: float  # vertical, degrees
+    view_angle: float  # Vertical, degrees.
     resolution: tuple[int, int]
 
     def project(self, points: Array) -> Array:
@@ -41,7 +41,7 @@ def framing(
     view_angle: float = 28.0,
     fill: tuple[float, float] = (0.80, 0.84),
 ) -> Camera:
-    """The camera that shows the whole box [lower, upper] inside the part `fill` of the width and the height.
+    """Camera that shows the whole box [lower, upper] inside the share `fill` of the width and the height.
 
     `azimuth` and `elevation` in degrees, around and above the plane normal to `up`. The smallest distance that keeps
     the corner p inside is |p . right| / tan(angle) - p . forward, so the nearest camera is a maximum over corners.
@@ -56,7 +56,7 @@ def framing(
     tan_h = np.tan(0.5 * np.radians(view_angle)) * resolution[0] / resolution[1] * fill[0]
     corners = np.array([[upper[k] if i >> k & 1 else lower[k] for k in range(3)] for i in range(8)])
     center = 0.5 * (lower + upper)
-    for _ in range(3):  # perspective makes the near side larger: recentre on what is seen, then measure again
+    for _ in range(3):  # Perspective makes the near side larger: recentre on the visible part, then measure again.
         rel = corners - center
         depth = rel @ forward
         distance = max(np.max(np.abs(rel @ right) / tan_h - depth), np.max(np.abs(rel @ top) / tan_v - depth))
@@ -67,14 +67,14 @@ def framing(
 
 
 def horizontal_axes(up: Array) -> tuple[Array, Array]:
-    """Two unit vectors normal to `up`, which with it make a right-handed (side, up, front) frame."""
+    """Two unit vectors normal to `up`, which form a right-handed frame (side, up, front) with it."""
     reference = np.array([1.0, 0.0, 0.0]) if abs(up[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
     side = reference - (reference @ up) * up
     side /= np.linalg.norm(side)
     return side, np.cross(side, up)
 
 
-LIGHTS = (0.85, 0.40)  # strengths of the key light and of the fill light
+LIGHTS = (0.85, 0.40)  # Strengths of the key light and of the fill light.
 
 
 def light_directions(camera: Camera) -> tuple[Array, Array]:

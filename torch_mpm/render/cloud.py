@@ -1,4 +1,4 @@
-"""What a cloud of particles looks like from outside: its spacing, the particles that can be seen, its surface."""
+"""External appearance of a cloud of particles: spacing, visible particles, surface."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ def rest_spacing(x: Array) -> float:
 def visible(x: Array, spacing: float) -> Array:
     """Mask [P] of the particles [P, 3] that are not enclosed by two layers of occupied cells.
 
-    Cells are 1.5 spacings wide: each holds a particle in any undisturbed body. Enclosed particles cannot be seen,
-    and a renderer that is spared them takes a fraction of the time.
+    Cells are 1.5 spacings wide: each holds a particle in any undisturbed body. Enclosed particles are invisible, and
+    rendering without them takes a fraction of the time.
     """
     cell = 1.5 * spacing
     lower = x.min(axis=0)
     shape = np.floor(np.ptp(x, axis=0) / cell).astype(np.int64) + 5
-    if np.prod(shape.astype(np.float64)) > 5e7:  # a few stray particles far away: not worth a huge table
+    if np.prod(shape.astype(np.float64)) > 5e7:  # A few stray particles far away do not justify a huge table.
         return np.ones(len(x), dtype=bool)
     index = np.ravel_multi_index(tuple((np.floor((x - lower) / cell).astype(np.int64) + 2).T), tuple(shape))
     inside = np.zeros(shape, dtype=bool)
@@ -104,7 +104,7 @@ def surface(x: Array, rgb: Array, spacing: float) -> Skin:
 def contour(
     field: Array, level: float, spacing: float, lower: Array, attribute: Array | None = None
 ) -> tuple[Array, Array, Array, Array]:
-    """Where `field` [X, Y, Z] passes `level`: vertices [V, 3], triangles int [T, 3], normals [V, 3], attributes [V, C].
+    """Level set `level` of `field` [X, Y, Z]: vertices [V, 3], triangles int [T, 3], normals [V, 3], attributes [V, C].
 
     Normals point from larger to smaller values. Nodes are `spacing` apart from `lower` on; `attribute` [X, Y, Z, C]
     is interpolated to the vertices (C = 0 without). Flying edges (Schroeder et al. 2015).

@@ -1,4 +1,4 @@
-"""What a particle's colour means: the scalar behind each name, its unit, its range and its colour map."""
+"""Colours of particles: the scalar behind each name, its unit, its range and its colour map."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from .requires import require
 from .shapes import Array
 
 PLAIN = (0.20, 0.45, 0.78)
-# Okabe and Ito's palette (2008), told apart with any colour vision.
+# Palette of Okabe and Ito (2008), distinguishable with any colour vision.
 MATERIALS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#7F7F7F")
-# Light and dark sands in turn, so that neighbouring layers differ.
+# Alternating light and dark sands, so that neighbouring layers differ.
 LAYERS = ("#E9C98A", "#8A5A2B", "#D9A75B", "#5E4630", "#F2DFB4", "#A8743C")
 PALETTES = {"material": MATERIALS, "layer": LAYERS}
-"""Colours of quantities that count rather than measure."""
+"""Names of quantities that are categories."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ QUANTITIES = {
 
 
 def numpy_of(value: Any) -> Array:
-    """A numpy array from a torch tensor (any device) or anything that numpy reads."""
+    """A numpy array from a torch tensor (any device) or anything that numpy accepts."""
     if hasattr(value, "detach"):
         value = value.detach().cpu().numpy()
     return np.asarray(value)
@@ -62,7 +62,7 @@ def scalar_of(color_by: str, values: Array, count: int) -> Array:
 
 
 def value_range(values: Array, from_zero: bool) -> tuple[float, float]:
-    """The range that holds 98 per cent of the finite values; a little more than one value, (0, 1) without any."""
+    """Range of 98 per cent of the finite values; slightly widened around one value, (0, 1) without any."""
     finite = values[np.isfinite(values)]
     if finite.size == 0:
         return 0.0, 1.0
@@ -72,7 +72,7 @@ def value_range(values: Array, from_zero: bool) -> tuple[float, float]:
 
 
 def map_colors(values: Array, limits: tuple[float, float], cmap: str) -> Array:
-    """uint8 [P, 3]: `limits` are the ends of the colour map, values beyond them take the end colours, NaN is grey."""
+    """uint8 [P, 3]: `limits` are the ends of the colour map, values beyond them get the end colours, NaN is grey."""
     table = (require("matplotlib").colormaps[cmap](np.linspace(0, 1, 256))[:, :3] * 255).round().astype(np.uint8)
     unit = (values - limits[0]) / (limits[1] - limits[0])
     rgb = table[(np.clip(np.nan_to_num(unit, nan=0.0), 0, 1) * 255).round().astype(np.int64)]

@@ -1,4 +1,4 @@
-"""The ground: a plane with a fine ruling, soft shadows under the bodies, fading into the background."""
+"""The ground: a plane with a fine ruling and soft shadows, fading into the background."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ GROUND = np.array([0.88, 0.89, 0.905])
 
 
 class Ground:
-    """A square plate under the box [lower, upper], whose picture `texture` depends on what stands above it.
+    """Square plate under the box [lower, upper], with a `texture` that depends on the bodies above it.
 
     Shadows are drawn into the texture: everything is projected along `light` (the direction in which it shines), and
     blurred more the higher it is, as a lamp of finite size does.

@@ -1,4 +1,4 @@
-"""PNG files that are whole or absent, and contact sheets."""
+"""PNG files that are complete or absent, and contact sheets."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ NOTE = "torch_mpm"
 
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A temporary path beside `path` that takes its place when the block ends well and vanishes when it does not."""
+    """Temporary path beside `path` that is renamed to it when the block succeeds and removed when it fails."""
     target = Path(path)
     temporary = building_path(target, target.suffix)
     try:
@@ -39,10 +39,10 @@ def check_image(name: str, image: Array) -> Array:
 
 
 def write_png(path: str | os.PathLike[str], image: Array, width: int | None = None, note: str = "") -> None:
-    """Write `image` uint8 [H, W, 3] to `path`; a killed process leaves no part of it there.
+    """Write `image` uint8 [H, W, 3] to `path`, atomically.
 
     `width` scales the picture to that many pixels and compresses harder: for a README, where size matters. `note` is
-    kept in the file, for `note_of`.
+    stored in the file, for `note_of`.
     """
     pil = require("PIL.Image")
     picture = pil.fromarray(check_image("image", image))
@@ -60,7 +60,7 @@ def note_of(path: str | os.PathLike[str]) -> str:
     try:
         with require("PIL.Image").open(path) as picture:
             return str(picture.info.get(NOTE, ""))
-    except Exception:  # whatever is wrong with the file
+    except Exception:  # For any defect of the file.
         return ""
 
 
@@ -71,7 +71,7 @@ def read_png(path: str | os.PathLike[str]) -> Array:
 
 
 def contact_sheet(frames: Sequence[Array], columns: int, width: int = 1280, gap: int = 4) -> Array:
-    """The frames (uint8 [H, W, 3], one size) scaled into a table of `columns` columns, `width` pixels wide."""
+    """Frames (uint8 [H, W, 3], one size) scaled into a table of `columns` columns, `width` pixels wide."""
     if not frames:
         raise ValueError("frames must hold at least one picture, got none")
     if columns < 1:

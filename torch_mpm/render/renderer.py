@@ -31,13 +31,13 @@ class Renderer:
         bounds: (lower [D], upper [D]) of the domain in metres; D = 2 or 3. It is drawn as a box and framed.
         resolution: (width, height) in pixels.
         color_by: "speed" [m/s], "stress" (von Mises) or "pressure" [Pa], "temperature" [K], "material", "layer", any
-            other label for a scalar of your own (then give `unit`), or None for one colour.
-        range: (lo, hi) of the colour scale in that unit. None takes each frame's own, which flickers in a video.
-        cmap: a matplotlib colour map name; None takes the quantity's own.
-        unit: unit shown on the scale; None takes the quantity's own.
+            other label for a user scalar (then give `unit`), or None for one colour.
+        range: (lo, hi) of the colour scale in that unit. None uses the range of each frame, which flickers in a video.
+        cmap: a matplotlib colour map name; None uses that of the quantity.
+        unit: unit shown on the scale; None uses that of the quantity.
         gravity: [D] vector; its opposite is up. Default: up is y.
-        radius: particle radius [m]; None takes 0.6 (0.75 in 2-D) of the spacing of the first frame's particles, or of
-            those that `fit_radius` is given.
+        radius: particle radius [m]; None uses 0.6 (0.75 in 2-D) of the particle spacing of the first frame, or of the
+            argument of `fit_radius`.
         style: "particles" (spheres, discs in 2-D) or "surface" (3-D only: a smooth skin around the particles).
         materials: names of materials 0, 1, ... for the legend of color_by="material".
         azimuth, elevation: direction of the camera in degrees (3-D), around and above the horizontal plane.
@@ -45,8 +45,8 @@ class Renderer:
         exaggeration: scale of heights over that of lengths (2-D); particles stay round.
         origin: coordinates [m], D numbers, to which all others are relative: the axes show theirs (2-D).
         ground: draw the ground at the lower face of the bounds (3-D).
-        backend: "vtk", "software" (3-D without OpenGL, plainer), or "auto": VTK, and where VTK finds no OpenGL
-            a logged warning and "software". The attribute `backend` tells which it became; 2-D is "matplotlib".
+        backend: "vtk", "software" (3-D without OpenGL, plainer), or "auto": VTK, and where VTK finds no OpenGL a logged
+            warning and "software". The attribute `backend` is the selected one; 2-D is "matplotlib".
 
     Raises:
         ImportError: a package of the `render` extra is missing.
@@ -119,10 +119,9 @@ class Renderer:
         """One picture, uint8 [H, W, 3].
 
         Args:
-            x: positions [P, D] in metres, torch or numpy. Particles that are not finite are left out and logged.
-            scalars: [P] for the colour; velocities [P, D] will do for "speed", stresses [P, 3, 3] for "stress"
-                (von Mises; in 2-D with the out-of-plane component), numbers for "material" and "layer". Not finite:
-                grey.
+            x: positions [P, D] in metres, torch or numpy. Particles that are not finite are skipped and logged.
+            scalars: [P] for the colour; also velocities [P, D] for "speed", stresses [P, 3, 3] for "stress" (von Mises;
+                in 2-D with the out-of-plane component), numbers for "material" and "layer". Not finite: grey.
             obstacles: shapes of `torch_mpm.render.shapes` at their poses at this time.
             overlays: (points [N, D] in metres, colour, label) polylines over the picture.
             time: seconds, written into the picture.
@@ -149,7 +148,7 @@ class Renderer:
         return self._annotate(image, overlays, limits, title, stamp)
 
     def fit_radius(self, x: Array) -> None:
-        """Choose the radius from particles [P, D], where it is neither given nor chosen yet; `frame` does so, too."""
+        """Choose the radius from particles [P, D], where it is neither given nor chosen yet; `frame` does this too."""
         x = x[np.isfinite(x).all(axis=1)]
         if self.radius is None and len(x):
             extent = float(np.max(self.bounds[1] - self.bounds[0]))
@@ -161,7 +160,7 @@ class Renderer:
         return self.scene.to_pixels(at) if isinstance(self.scene, Scene2D) else self.scene.camera.project(at)[:, :2]
 
     def close(self) -> None:
-        """Give the renderer's OpenGL context back (3-D)."""
+        """Release the renderer's OpenGL context (3-D)."""
         if not isinstance(self.scene, Scene2D):
             self.scene.close()
 
@@ -217,7 +216,7 @@ def _up(gravity: npt.ArrayLike | None) -> Array:
 
 
 def _choose(backend: str) -> str:
-    """The backend that draws 3-D on this machine."""
+    """Backend that draws 3-D on this machine."""
     if backend == "software":
         return backend
     try:

@@ -8,7 +8,7 @@ from typing import Any
 from .. import memory, optional
 
 SIZES = {"vtk": 7e8, "vtkmodules": 7e8, "matplotlib": 2e8}
-"""Memory that the import of a package takes at most [bytes]: VTK and kiwisolver end the process where it fails."""
+"""Maximum memory of the import of a package [bytes]: VTK and kiwisolver end the process where it fails."""
 
 
 class RenderError(RuntimeError):
@@ -16,7 +16,7 @@ class RenderError(RuntimeError):
 
 
 def require(module: str) -> Any:
-    """Import `module` or say which extra brings it.
+    """Import `module` or raise an error that names the extra that provides it.
 
     Raises:
         ImportError, MemoryError: as `torch_mpm.optional.load`.

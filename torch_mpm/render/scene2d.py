@@ -31,7 +31,7 @@ class Scene2D:
         lower, upper = bounds
         left = (5 if origin is None else 8) * self.size * DPI / 72 / resolution[0]
         width = 0.97 - left - (scale_width(resolution) if scale else 0)
-        line = self.size * DPI / 72 / resolution[1]  # share of the height that a line of text takes
+        line = self.size * DPI / 72 / resolution[1]  # Share of the height of a line of text.
         bottom, top = max(0.11, 3.8 * line), max(0.11, 2.6 * line)
         height = 1 - bottom - top
         aspect = exaggeration * (upper[1] - lower[1]) / (upper[0] - lower[0]) * resolution[0] / resolution[1]

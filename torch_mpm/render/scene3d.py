@@ -16,7 +16,7 @@ from .ground import BACKGROUND, Ground
 from .requires import RenderError, require
 from .shapes import Array, Shape, surface_samples
 
-CULL_FROM = 20_000  # particles; below this, finding the hidden ones costs more than drawing them
+CULL_FROM = 20_000  # Number of particles below which finding hidden ones costs more than drawing them.
 
 # Off-screen windows in the order of preference: GPU or Mesa through EGL, Mesa's OSMesa, then the system's own.
 WINDOWS = ("vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow", "vtkRenderWindow")
@@ -37,7 +37,7 @@ raise SystemExit(0 if window.SupportsOpenGL() else 3)
 def window_class() -> Any:
     """The VTK window that can draw on this machine; raises RenderError when there is none.
 
-    VTK's wheel brings no OpenGL of its own and crashes where there is none, so separate processes try first.
+    VTK's wheel includes no OpenGL and crashes without one, so separate processes try first.
     """
     modules = [require("vtkmodules.vtkRenderingOpenGL2"), require("vtkmodules.vtkRenderingCore")]
     for kind in WINDOWS:
@@ -85,7 +85,7 @@ class Scene3D:
         for actor in self.moving:
             self.renderer.RemoveActor(actor)
         if self.occlusion and any(o.opacity < 1 for o in obstacles):
-            self._add_passes(occlusion=False)  # it would darken what is behind glass in stripes
+            self._add_passes(occlusion=False)  # It would darken objects behind glass in stripes.
             self.occlusion = False
         self.moving = [self._obstacle_actor(o) for o in obstacles]
         shown = visible(x, 2 * radius) if len(x) > CULL_FROM and style == "particles" else np.ones(len(x), dtype=bool)
@@ -103,7 +103,7 @@ class Scene3D:
         return self._pixels()
 
     def close(self) -> None:
-        """Give the OpenGL context and its memory back."""
+        """Release the OpenGL context and its memory."""
         self.window.Finalize()
 
     def _place_camera(self) -> None:
@@ -222,7 +222,7 @@ class Scene3D:
         return actor
 
     def _polydata(self, points: Array, faces: Array | None) -> Any:
-        """Triangles, or, without faces, one cell that holds every point (the sphere mapper draws cells' points)."""
+        """Triangles, or, without faces, one cell with all points (the sphere mapper draws the points of cells)."""
         out = self.data.vtkPolyData()
         vertices = require("vtkmodules.vtkCommonCore").vtkPoints()
         vertices.SetData(self._array(points.astype(np.float32)))

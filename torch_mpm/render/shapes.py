@@ -1,4 +1,4 @@
-"""Rigid bodies as pictures see them: a triangle mesh (3-D) or an outline (2-D) in body coordinates, and a pose."""
+"""Rigid bodies in pictures: a triangle mesh (3-D) or an outline (2-D) in body coordinates, and a pose."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def vector(name: str, value: npt.ArrayLike, dim: int | None = None) -> Array:
 
 
 def rotation_matrix(rotation: npt.ArrayLike, dim: int) -> Array:
-    """A rotation matrix [D, D]; in 2-D an angle in radians will do."""
+    """Rotation matrix [D, D]; in 2-D also given as an angle in radians."""
     out = np.asarray(rotation, dtype=np.float64)
     if out.ndim == 0 and dim == 2:
         return np.array([[np.cos(out), -np.sin(out)], [np.sin(out), np.cos(out)]])
@@ -67,7 +67,7 @@ def rotation_matrix(rotation: npt.ArrayLike, dim: int) -> Array:
 
 
 def plane(point: npt.ArrayLike, normal: npt.ArrayLike, size: float, color: tuple[float, float, float] = GREY) -> Shape:
-    """A plate of side `size` [m] around `point`, whose visible side looks along `normal`; a thick line in 2-D."""
+    """Plate of side `size` [m] around `point`, with its visible side along `normal`; a thick line in 2-D."""
     at, n = vector("point", point), vector("normal", normal)
     return _along(surface_mesh.plate(0 * at, _up(at), size), at, n / np.linalg.norm(n), color)
 
@@ -133,7 +133,7 @@ def _up(like: Array) -> Array:
 
 
 def _along(piece: SurfaceMesh, center: Array, axis: Array, color: tuple[float, float, float]) -> Shape:
-    """A body made along the y axis, turned to the unit vector `axis`."""
+    """Body created along the y axis, rotated to the unit vector `axis`."""
     return Shape(piece.vertices, piece.faces, center, frame_of(axis), color)
 
 
@@ -146,7 +146,9 @@ def _segment(a: npt.ArrayLike, b: npt.ArrayLike) -> tuple[Array, Array, float]:
 
 @dataclass(frozen=True)
 class Samples:
-    """Points [N, 3] m spread over a surface, normals [N, 3] there, and the radius [m] of the disc each stands for."""
+    """Points [N, 3] m spread over a surface, normals [N, 3] there, and the radius [m] of the disc that each
+    represents.
+    """
 
     points: Array
     normals: Array

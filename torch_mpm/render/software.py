@@ -19,7 +19,7 @@ AMBIENT, DIFFUSE = 0.36, 0.85
 
 
 def _screened(samples: Samples, opacity: float) -> Samples:
-    """A share `opacity` of the samples, as a screen that one sees through."""
+    """Stipple that covers a share `opacity` of the samples."""
     kept = np.arange(len(samples.points)) * 0.618034 % 1 < opacity
     return Samples(samples.points[kept], samples.normals[kept], samples.radius)
 
@@ -53,7 +53,7 @@ class SoftwareScene:
         return image
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Nothing to release."""
 
     def _splat(self, image: Array, points: Array, radii: Array, rgb: Array, normals: Array) -> None:
         width, height = self.camera.resolution
@@ -92,7 +92,7 @@ class SoftwareScene:
         image.reshape(-1, 3)[pixel] = (rgb[owner] * strength[:, None]).clip(0, 255).astype(np.uint8)
 
     def _ground_pixels(self, texture: Array) -> Array:
-        """Where each pixel's ray meets the ground, the texture there; elsewhere the background."""
+        """Intersection of each pixel's ray with the ground, and the texture there; elsewhere the background."""
         assert self.ground is not None
         width, height = self.camera.resolution
         tan = np.tan(0.5 * np.radians(self.camera.view_angle)) * 2 / height

@@ -1,4 +1,4 @@
-"""MP4 files (H.264, yuv420p) through the ffmpeg that imageio-ffmpeg ships."""
+"""MP4 files (H.264, yuv420p) by the ffmpeg of imageio-ffmpeg."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class VideoWriter:
         self.frames += 1
 
     def close(self) -> None:
-        """Finish the file and give it its name. Raises RenderError when there is no frame or the encoder failed."""
+        """Finish the file and rename it. Raises RenderError when there is no frame or the encoder failed."""
         if self._process is None:
             raise RenderError(f"{self.path}: a video needs at least one frame")
         assert self._process.stdin is not None
@@ -88,7 +88,7 @@ class VideoWriter:
         codec = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", f"{self.quality}", "-preset", "medium"]
         command = [self._ffmpeg, "-y", "-loglevel", "error", *source, "-an", *codec, "-movflags", "+faststart"]
         words = [*command, "-f", "mp4", str(temporary)]
-        with held_signals():  # otherwise an encoder could start that is never stopped
+        with held_signals():  # Otherwise an encoder could start that is never stopped.
             self._process = subprocess.Popen(words, stdin=subprocess.PIPE, stderr=self._log)
 
     def _failure(self) -> RenderError:

@@ -5,7 +5,7 @@ try:
 except (ImportError, MemoryError):
     from ..optional import load as _load
 
-    _load("pydantic", "scene files", "scene")  # raises with the reason
+    _load("pydantic", "scene files", "scene")  # Raises with the reason.
 
 from .explain import SceneError
 from .scene import Scene

@@ -1,4 +1,4 @@
-"""From the words of a scene to particles, laws, obstacles and emitters; and the checks that need geometry."""
+"""Particles, laws, obstacles and emitters of a scene file; and the checks that need geometry."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 @dataclass(frozen=True)
 class Material:
-    """A material of one scene: its words, the index of its scene, and its place among the laws of the step."""
+    """Material of one scene: its words, the index of its scene, and its index among the laws of the step."""
 
     name: str
     words: schema.NeoHookean | schema.WeaklyCompressible | schema.QuarticSand | schema.Solid
@@ -38,14 +38,14 @@ class Material:
 
 @dataclass(frozen=True)
 class Nozzle:
-    """An emitter ready to run: a layer of particles appears at each of its times."""
+    """Emitter ready to run: a layer of particles appears at each of its times."""
 
     layer: State
     material: int
     times: list[float]
 
     def turned(self, number: int) -> State:
-        """The layer, in 3-D turned about the axis of the nozzle, so that one does not line up with the one before."""
+        """Layer, in 3-D rotated about the axis of the nozzle, so that it is not aligned with the previous one."""
         x, v = self.layer.x, self.layer.v
         if x.shape[1] == 2:
             return self.layer
@@ -56,7 +56,7 @@ class Nozzle:
 
 @dataclass(frozen=True)
 class Built:
-    """A scene ready to run. ``materials`` are those of all scenes, ``material`` [P] those of the first particles."""
+    """Scene ready to run. ``materials`` are those of all scenes, ``material`` [P] those of the initial particles."""
 
     grid: Grid
     step: Step
@@ -67,16 +67,16 @@ class Built:
     scenes: list[str]
 
     def emissions(self) -> list[tuple[float, int]]:
-        """(time, nozzle) of every layer, in the order in which they appear."""
+        """(time, nozzle) of every layer, in the order of appearance."""
         return sorted((time, k) for k, nozzle in enumerate(self.nozzles) for time in nozzle.times)
 
     @property
     def particles(self) -> int:
-        """Number of particles once every emitter is empty."""
+        """Number of particles after the last layer."""
         return len(self.state) + sum(len(n.layer) * len(n.times) for n in self.nozzles)
 
     def statics(self) -> dict[str, Tensor]:
-        """Mass, volume, material and scene of all particles, also of those still to come, by id."""
+        """Mass, volume, material and scene of all particles, including those not yet emitted, by id."""
         layers = [(self.nozzles[k].layer, self.nozzles[k].material) for _, k in self.emissions()]
         states = [self.state, *(layer for layer, _ in layers)]
         material = [self.material, *(torch.full((len(s),), m, dtype=torch.int32, device="cpu") for s, m in layers)]
@@ -132,7 +132,7 @@ def build(scene: Any, device: torch.device) -> Built:
         nothing = State.at_rest(empty, dtype=dtype)
         parts = [nothing if scene.heat is None else nothing.replace(temperature=torch.zeros_like(nothing.mass))]
         material = [torch.empty(0, dtype=torch.int32)]
-    together = State.concatenate(parts).to(device)  # at once, as each copy to a device waits
+    together = State.concatenate(parts).to(device)  # Together, since each copy to a device waits.
     first = _complete(together, mixture, torch.cat(material), single=len(entries) == 1)
     nozzles = [
         Nozzle(
@@ -161,7 +161,7 @@ def build(scene: Any, device: torch.device) -> Built:
 
 
 def _named(key: str, make: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
-    """Call ``make``; an error it raises is reported under a key of the scene."""
+    """Call ``make``; an error is reported under a key of the scene."""
     try:
         return make(*arguments, **options)
     except (ValueError, TypeError) as error:
@@ -180,7 +180,7 @@ def _check_mass(scene: Any, states: Sequence[State]) -> None:
 
 
 def _check_fields(scene: Any, state: State) -> None:
-    """The fields that the outputs ask for are those of some material."""
+    """Check that the fields of the outputs exist for some material."""
     values = {"F": state.F, "J": state.J, "temperature": state.temperature, "liquid": state.extra.get(LIQUID)}
     absent = [name for name in scene.trajectory_fields if name in values and values[name] is None]
     if absent:
@@ -193,9 +193,9 @@ def _check_fields(scene: Any, state: State) -> None:
 
 
 class _Mixture:
-    """Materials of all scenes, and the laws that serve them.
+    """Materials of all scenes, and their laws.
 
-    Materials of one kind, at most one of them per scene, share one law whose parameters are per scene.
+    Materials of one kind, at most one of them per scene, share one law with parameters per scene.
     """
 
     def __init__(self, entries: Sequence[Any], reference: float) -> None:
@@ -210,7 +210,7 @@ class _Mixture:
         ]
         self._numbers = {(m.scene, m.name): number for number, m in enumerate(self.materials)}
         groups: dict[tuple[Any, ...], list[int]] = {}
-        before: Counter[tuple[Any, ...]] = Counter()  # materials of one form in one scene
+        before: Counter[tuple[Any, ...]] = Counter()  # Materials of one form in one scene.
         for number, m in enumerate(self.materials):
             form = _form(m.words)
             groups.setdefault((form, before[m.scene, form]), []).append(number)
@@ -218,7 +218,7 @@ class _Mixture:
         self.groups = list(groups.values())
 
     def words(self) -> list[Any]:
-        """The words of one material of each law."""
+        """Words of one material of each law."""
         return [self.materials[group[0]].words for group in self.groups]
 
     def number(self, scene: int, name: str) -> int:
@@ -284,7 +284,7 @@ def _friction(hardening: Sequence[float] | None, angle: Any) -> dict[str, Any]:
 
 
 def _form(words: Any) -> tuple[Any, ...]:
-    """What must be the same in materials that share a law."""
+    """Properties that materials with a common law must share."""
     names = ("energy", "apex", "smallest_strain", "flow", "volume_correction", "hardening")
     options = [*(getattr(words, name, None) for name in names), getattr(words, "cohesion", 0.0) > 0]
     options += [getattr(words, name, None) for name in (*heat.THERMAL, "liquid")]
@@ -295,7 +295,7 @@ def _form(words: Any) -> tuple[Any, ...]:
 
 
 def _complete(state: State, mixture: _Mixture, material: Tensor, single: bool) -> State:
-    """Drop or add the indices that the step asks for."""
+    """Drop or add the indices that the step needs."""
     law = mixture.law_of(material).to(state.x.device) if len(mixture.groups) > 1 else None
     return state.replace(scene=None if single else state.scene, material=law)
 
@@ -308,12 +308,12 @@ Placed = list[tuple[str, Any, seed.Points, "seed.Region | None"]]
 
 
 def _placed(scene: Any, origin: Sequence[float] | None, entry: Any, problems: list[str]) -> Placed:
-    """The bodies in which nothing is wrong; what their particles show to be wrong is added to the problems.
+    """Bodies without problems; problems shown by their particles are added to the list.
 
-    The coordinates of the scene are relative to its origin in those of files and messages.
+    The coordinates of the scene are relative to its origin; those of files and messages are not.
     """
     if any(problem.startswith("grid") or ".per_cell: " in problem for problem in problems):
-        return []  # without a lattice, or with too many particles for the memory
+        return []  # Without a lattice, or with too many particles for the memory.
     placed = []
     for k, (key, body) in enumerate(entry.keyed("body")):
         if not _is_good(key, problems):
@@ -323,7 +323,7 @@ def _placed(scene: Any, origin: Sequence[float] | None, entry: Any, problems: li
         except (ValueError, OSError) as error:
             problems.append(f"{key}{check.called(body)}: {error}")
             continue
-        file = isinstance(body, schema.MeshBody)  # other shapes were checked before
+        file = isinstance(body, schema.MeshBody)  # Other shapes were checked before.
         found = list(check.bounds_problems(key, body, shape, scene.grid, origin)) if file and shape is not None else []
         if not found and not check.inside(scene.grid, points.x):
             lower, upper = points.x.amin(0), points.x.amax(0)
@@ -358,7 +358,7 @@ def _matter(
     heat: schema.Heat | None,
     dtype: torch.dtype,
 ) -> State:
-    """The particles of a body at rest in themselves, on the host."""
+    """Particles of a body without internal motion, on the host."""
     index = torch.full((len(points),), scene, dtype=torch.int32)
     points = seed.Points(points.x, points.volume, index)
     if body.spin is None:
@@ -372,7 +372,7 @@ def _matter(
 
 
 def _warmed(state: State, words: schema.Seeding, heat: schema.Heat | None) -> State:
-    """Matter at its temperature, in a scene with heat."""
+    """State with the temperature of the body, in a scene with heat."""
     if heat is None:
         return state
     temperature = 0.0 if words.temperature is None else words.temperature - heat.reference
@@ -406,7 +406,7 @@ def _nozzle(
 def emitter_layer(words: schema.Emitter, grid: schema.Grid, duration: float) -> tuple[seed.Points, list[float]]:
     """One layer of an emitter and the times at which it appears.
 
-    A layer is one particle spacing thick; their number is whole and their volumes add up to rate x time.
+    A layer is one particle spacing thick; their number is an integer and their volumes add up to rate x time.
     """
     velocity = torch.tensor(words.velocity, dtype=torch.float64)
     speed, dim = float(velocity.norm()), len(words.center)
@@ -426,16 +426,18 @@ def emitter_layer(words: schema.Emitter, grid: schema.Grid, duration: float) -> 
 
 
 def _across(direction: Tensor) -> Tensor:
-    """Orthonormal vectors across a direction, [D - 1, D]."""
+    """Orthonormal vectors normal to a direction, [D - 1, D]."""
     basis = torch.linalg.qr(torch.cat([direction[None], torch.eye(len(direction), dtype=torch.float64)]).T).Q
     return basis.T[1 : len(direction)]
 
 
-# ---- the whole
+# ---- overlaps
 
 
 def _overlaps(placed: Placed, obstacles: Sequence[tuple[str, Any]]) -> Iterator[str]:
-    """Bodies within each other, and within obstacles that are there from the start; the first other body of each."""
+    """Overlaps of bodies with each other, and with obstacles that exist from the start; the first other body of
+    each.
+    """
     meet = _boxes_meet(placed)
     seen = set()
     for i, (key, _, points, _) in enumerate(placed):
@@ -460,7 +462,7 @@ def _overlaps(placed: Placed, obstacles: Sequence[tuple[str, Any]]) -> Iterator[
 
 
 def _boxes_meet(placed: Placed) -> npt.NDArray[Any]:
-    """Whether the box around the points of body i and that around the shape of body j meet, bool [n, n].
+    """Whether the box around the points of body i and that around the shape of body j overlap, bool [n, n].
 
     Without a shape, a body has no box.
     """
@@ -471,7 +473,7 @@ def _boxes_meet(placed: Placed) -> npt.NDArray[Any]:
         lower[k], upper[k] = (end.numpy() for end in points.x.aminmax(dim=0))
         a[k], b[k] = (nowhere, nowhere) if shape is None else (shape.lower, shape.upper)
     meet = np.ones((len(placed), len(placed)), bool)
-    for axis in range(dim):  # comparisons with NaN are false
+    for axis in range(dim):  # Comparisons with NaN are false.
         meet &= (lower[:, None, axis] <= b[None, :, axis]) & (upper[:, None, axis] >= a[None, :, axis])
     return meet
 

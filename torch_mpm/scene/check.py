@@ -1,6 +1,6 @@
-"""What is wrong with a scene, as far as can be said before a particle is seeded.
+"""Problems of a scene that can be found before particles are seeded.
 
-Pieces of the scene that could not be understood are None (:mod:`.partial`); what depends on them is not judged.
+Invalid parts of the scene are None (:mod:`.partial`); parts that depend on them are not checked.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from . import heat, schema
 from .places import obstacle, region, relative
 
 PARTICLE_BYTES = 400
-"""Memory that a particle takes at least while a scene is built and simulated."""
+"""Minimum memory per particle while a scene is built and simulated."""
 NODES = 2**33
-"""Nodes along an axis beyond which no grid can have fewer than 2^31 blocks."""
+"""Number of nodes along an axis beyond which no grid can have fewer than 2^31 blocks."""
 FRAMES = 10**8
 PIXELS = range(16, 16385)
 
 
 def problems(scene: Any, entries: Sequence[Any]) -> list[str]:
-    """One line for each mistake, beginning with its key."""
+    """One line for each problem, beginning with its key."""
     found = [
         *_grid_problems(scene, len(entries)),
         *_time_problems(scene),
@@ -51,11 +51,11 @@ def problems(scene: Any, entries: Sequence[Any]) -> list[str]:
                     found += _item_problems(key, item, scene)
         if not found:
             found += _size_problems(scene, entries)
-    return list(dict.fromkeys(found))  # entries of a batch share what stands outside of them
+    return list(dict.fromkeys(found))  # Entries of a batch share everything outside of them.
 
 
 def file_problems(entry: Any, folder: Path) -> Iterator[str]:
-    """Files of bodies that cannot be read."""
+    """Unreadable files of bodies."""
     for key, body in entry.keyed("body"):
         if isinstance(body, (schema.MeshBody, schema.PointsBody)):
             try:
@@ -107,7 +107,7 @@ def _corner_problems(grid: schema.Grid) -> Iterator[str]:
 
 
 def _range_problems(scene: Any) -> Iterator[str]:
-    """Numbers of the file that the precision of the simulation cannot hold."""
+    """Numbers of the file that exceed the precision of the simulation."""
     if scene.precision is None:
         return
     largest = torch.finfo(getattr(torch, scene.precision)).max
@@ -154,7 +154,7 @@ def output_problems(scene: Any) -> Iterator[str]:
 
 
 def render_problems(scene: Any) -> Iterator[str]:
-    """What no picture can be made of."""
+    """Problems of pictures."""
     words, grid = scene.render, scene.grid
     if words is None:
         return
@@ -179,7 +179,7 @@ def render_problems(scene: Any) -> Iterator[str]:
 
 
 def _item_problems(key: str, item: Any, scene: Any) -> list[str]:
-    """Mistakes of a body, an obstacle or an emitter."""
+    """Problems of a body, an obstacle or an emitter."""
     dim = len(scene.grid.lower)
     found = list(_dimension_problems(key, item, dim))
     if found or len(scene.grid.upper) != dim:
@@ -219,7 +219,8 @@ def _dimension_problems(key: str, item: Any, dim: int) -> Iterator[str]:
 def bounds_problems(
     key: str, item: Any, shape: seed.Region, grid: schema.Grid, origin: Sequence[float] | None = None
 ) -> Iterator[str]:
-    """A region that reaches out of the domain by more than its outermost particles keep away from its surface.
+    """Check of a region that extends beyond the domain by more than the distance of its outermost particles from its
+    surface.
 
     With an `origin` the coordinates are relative to it, and messages have those of the file.
     """
@@ -274,7 +275,7 @@ def nozzle_area(words: schema.Emitter) -> float:
 
 
 def _size_problems(scene: Any, entries: Sequence[Any]) -> Iterator[str]:
-    """Particles of all bodies and emitters against numbers and memory."""
+    """Compare the particles of all bodies and emitters with limits of numbers and memory."""
     counts: dict[str, float] = {}
     for entry in entries:
         for key, body in entry.keyed("body"):
@@ -300,7 +301,7 @@ def _size_problems(scene: Any, entries: Sequence[Any]) -> Iterator[str]:
 
 
 def _poured(words: schema.Emitter, scene: Any) -> float:
-    """About how many particles an emitter brings; whole layers of at least one particle."""
+    """Approximate number of particles of an emitter; complete layers of at least one particle."""
     dim, spacing = len(words.center), _spacing(words, scene.grid)
     area, speed = nozzle_area(words), math.hypot(*words.velocity)
     seconds = max(0.0, min(scene.duration, words.end or scene.duration) - words.start)
@@ -328,6 +329,6 @@ def called(item: Any) -> str:
 
 
 def _numbers(values: Sequence[float]) -> str:
-    """Four digits, or where they are far from zero as many as tell places apart."""
+    """Four digits, or for positions far from zero as many as are needed to distinguish them."""
     digits = 4 if max(map(abs, values)) < 1e4 else 10
     return "[" + ", ".join(f"{v:.{digits}g}" for v in values) + "]"

@@ -1,4 +1,4 @@
-"""The whole state of a run in one HDF5 file, from which it continues bit for bit."""
+"""Complete state of a run in one HDF5 file, from which it continues bit for bit."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ EXTRA = "extra."
 
 
 def tensors_of(state: State) -> Host:
-    """The tensors that a state has, by name, those of `extra` as "extra.NAME"."""
+    """Tensors of a state by name, those of `extra` as "extra.NAME"."""
     fields = {f.name: getattr(state, f.name) for f in dataclasses.fields(state)}
     fields |= {EXTRA + name: value for name, value in state.extra.items()}
     return {name: value for name, value in fields.items() if isinstance(value, Tensor)}
 
 
 def save(path: Path, tensors: Host, record: dict[str, Any]) -> None:
-    """Write tensors (on the CPU) and a JSON record; ``path`` is replaced at once, or not at all.
+    """Write tensors (on the CPU) and a JSON record; ``path`` is replaced atomically.
 
     Raises:
-        OSError: when the disk has no room.
+        OSError: when the disk is full.
     """
     image = io.BytesIO()
     with h5py_module().File(image, "w") as out:
@@ -54,7 +54,7 @@ def save(path: Path, tensors: Host, record: dict[str, Any]) -> None:
 
 
 def load(path: Path, device: torch.device | str = "cpu", remedy: str = REMEDY) -> tuple[State, dict[str, Any]]:
-    """The state that `save` wrote, in the memory order it had, and the record; `remedy` is for messages.
+    """State written by `save`, in its original memory order, and the record; `remedy` is for messages.
 
     Raises:
         DamagedFileError: for a file that is damaged or holds something else.

@@ -1,4 +1,4 @@
-"""What a scene will use and take: for `torch-mpm check` and `torch-mpm info SCENE`."""
+"""Requirements of a scene: for `torch-mpm check` and `torch-mpm info SCENE`."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ TRIAL_STEPS = 3
 def describe(scene: Scene, built: Built) -> dict[str, Any]:
     """Fields in use with their bytes per particle, estimated time step and run time, and size of the trajectory.
 
-    The run time is that of a few substeps with half of what emitters bring, times the number of substeps that the
-    stability limit of the first state asks for.
+    The run time is that of a few substeps with half of the emitted particles, times the number of substeps for the
+    stability limit of the first state.
     """
     check_substeps(scene, built)
     state = _halfway(built)
@@ -52,7 +52,7 @@ def describe(scene: Scene, built: Built) -> dict[str, Any]:
 
 
 def _halfway(built: Built) -> State:
-    """The first state and half of what the emitters bring, left where it appears."""
+    """First state and half of the emitted particles, at the positions of their emission."""
     state = built.state
     for nozzle in built.nozzles:
         layer = State.concatenate([nozzle.layer] * math.ceil(len(nozzle.times) / 2))
@@ -66,7 +66,7 @@ def _trial(built: Built, state: State, dt: float) -> tuple[State, float]:
     begin = time.perf_counter()
     for _ in range(TRIAL_STEPS):
         state = built.step(state, dt)
-    built.step.check()  # also waits for the device
+    built.step.check()  # Also waits for the device.
     seconds = (time.perf_counter() - begin) / TRIAL_STEPS
     built.step.reset()
     return state, seconds

@@ -1,4 +1,4 @@
-"""What went wrong first: the steps since the last good state again, one at a time, each looked at."""
+"""Diagnosis of a failure: repetition of the steps since the last good state, one at a time, with a check of each."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ..step import Step
 
 @dataclass(frozen=True)
 class Failure:
-    """The first particle that went wrong: after which step, in which scene, and how."""
+    """First failed particle: after which step, in which scene, and how."""
 
     step: int
     time: float
@@ -32,7 +32,7 @@ class Failure:
 
 
 class SceneFailure(SimulationError):
-    """A run that had to stop; ``failure`` says what went first, or is None where the state shows nothing."""
+    """Error of a run that had to stop; ``failure`` names the first failure, or is None where the state shows none."""
 
     def __init__(self, message: str, failure: Failure | None = None) -> None:
         super().__init__(message)
@@ -41,8 +41,9 @@ class SceneFailure(SimulationError):
 
 @torch.no_grad()
 def wrong(step: Step, state: State, origin: Sequence[float] | None = None) -> tuple[int, str] | None:
-    """Row of the first particle that is not finite, outside the grid or inverted, and what is wrong with it; in
-    coordinates to which those of the state are relative by an origin."""
+    """Row of the first particle that is not finite, outside the grid or inverted, and a description; in coordinates to
+    which those of the state are relative by an origin.
+    """
     grid = step.grid
     lower, upper = (torch.tensor(a, dtype=state.x.dtype, device=state.x.device) for a in (grid.lower, grid.upper))
     finite_v = state.v.isfinite().all(1)
@@ -92,7 +93,7 @@ def replay(
     scenes: Sequence[str],
     origin: Sequence[float] | None = None,
 ) -> Failure | None:
-    """Take ``steps`` steps from a good state and report the first particle that goes wrong, as `wrong` does."""
+    """Compute ``steps`` steps from a good state and report the first failed particle in the form of `wrong`."""
     for k in range(steps):
         good, limit = state, float(step.stable_dt(state, 1.0).min())
         step.reset()

@@ -1,4 +1,4 @@
-"""One scene of a batch with all that it takes from the file."""
+"""One scene of a batch with all inherited words of the file."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from . import schema
 
 
 class ResolvedEntry(schema.Entry):
-    """One scene of a batch, complete. ``path`` begins the keys of its own things in messages.
+    """One scene of a batch, complete. ``path`` begins the keys of its own words in messages.
 
-    Its lists begin with ``own`` things of its own, by kind; those that the file has outside of the scenes follow.
+    Its lists begin with ``own`` words of its own, by kind, followed by those outside the scenes of the file.
     """
 
     path: str = ""
@@ -22,7 +22,7 @@ class ResolvedEntry(schema.Entry):
 
     @classmethod
     def resolved(cls, entry: schema.Content, shared: schema.Content | None = None, index: int = 0) -> ResolvedEntry:
-        """An entry with what it shares; or, without ``shared``, the only scene of a file."""
+        """Entry with its inherited words; or, without ``shared``, the only scene of a file."""
         kinds = ("body", "obstacle", "emitter")
         lists: dict[str, Any] = {kind: list(getattr(entry, kind)) for kind in kinds}
         if shared is None:
@@ -42,7 +42,7 @@ class ResolvedEntry(schema.Entry):
         )
 
     def keyed(self, kind: str) -> Iterator[tuple[str, Any]]:
-        """(key in the file, words) of all things of a kind that could be understood."""
+        """(key in the file, words) of all valid words of a kind."""
         own = self.own.get(kind, 0)
         for k, item in enumerate(getattr(self, kind)):
             if item is not None:

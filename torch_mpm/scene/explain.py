@@ -1,4 +1,4 @@
-"""Messages about what is wrong in a scene: the key, what it takes, and what may have been meant."""
+"""Messages about problems of a scene: the key, its accepted values, and the probable intention."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from pydantic import BaseModel, ValidationError
 from .schema import SceneData
 
 MOST_LINES = 20
-"""Problems in the message of an error."""
+"""Maximum number of problems in the message of an error."""
 MOST_LETTERS = 1000
-"""Of a problem in the message: values of files may be long."""
+"""Maximum length of a problem in the message: values of files may be long."""
 
 
 class SceneError(ValueError):
-    """A scene that cannot be simulated. ``problems`` has one line for each thing that is wrong."""
+    """Invalid scene. ``problems`` has one line for each problem."""
 
     def __init__(self, problems: Sequence[str], source: str = "") -> None:
         self.problems = list(problems)
@@ -36,7 +36,9 @@ def _shortened(line: str) -> str:
 
 
 def text_problems(words: Any, path: str = "") -> Iterator[str]:
-    """One line for each text, or name of a key, that no file can hold: with a null character or a lone surrogate."""
+    """One line for each text, or name of a key, that cannot be written to a file: with a null character or a lone
+    surrogate.
+    """
     if isinstance(words, dict):
         for key, value in words.items():
             place = f"{path}.{key}" if path else str(key)
@@ -79,7 +81,7 @@ def _line(item: Any, root: type[BaseModel]) -> str:
 
 
 def _locate(loc: Sequence[int | str], root: type[BaseModel]) -> tuple[type[BaseModel], str, Any, str]:
-    """Model that holds the key, its path as written in a file, its type and its description.
+    """Model with the key, its path in the notation of a file, its type and its description.
 
     The location that pydantic reports has the tag of a union as one more entry, which a file does not have.
     """
@@ -103,14 +105,14 @@ def _locate(loc: Sequence[int | str], root: type[BaseModel]) -> tuple[type[BaseM
         elif typing.get_origin(annotation) is dict:
             path += f".{entry}"
             annotation = _plain(typing.get_args(annotation)[1])
-        # Anything else names a branch of a plain union, which a file does not have either.
+        # Any other entry names a branch of a plain union, which a file does not have either.
         if isinstance(annotation, type) and issubclass(annotation, BaseModel):
             model = annotation
     return model, path, annotation, description
 
 
 def _plain(annotation: Any) -> Any:
-    """A type without Annotated and without None."""
+    """Type without Annotated and without None."""
     while typing.get_origin(annotation) is typing.Annotated:
         annotation = typing.get_args(annotation)[0]
     members = [a for a in _members(annotation) if a is not type(None)]

@@ -1,4 +1,4 @@
-"""Fields of a state by the names that trajectories and data sets give them."""
+"""Fields of a state by their names in trajectories and data sets."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ RANKS = {
     **{"F": 2, "C": 2, "J": 0, "stress": 2, "cauchy_stress": 2, "kirchhoff_stress": 2, "out_of_plane_stress": 0},
     **{"von_mises_stress": 0, "pressure": 0, "temperature": 0, "liquid": 0},
 }
-"""Axes of a field beside that of the particles, each of length D."""
+"""Number of axes of a field beside that of the particles, each of length D."""
 
 
 def field(step: Step, state: State, name: str, kirchhoff: Tensor | None = None) -> Tensor | None:
     """A field [P, ...] of a prepared state; None where the scene has none.
 
     Args:
-        step: whose law and whose reference temperature count.
-        state: what `step.prepare` gives.
+        step: step with the law and the reference temperature.
+        state: result of `step.prepare`.
         name: "position" [m], "velocity" [m/s], "F", "C" [1/s], "J", "temperature" [K], "liquid", or a stress [Pa]:
             "cauchy_stress" σ = τ/J or its other name "stress", "kirchhoff_stress" τ, and of Cauchy's stress
             "out_of_plane_stress" σ_zz (2-D, plane strain), "von_mises_stress" and "pressure" −tr σ/3 with three normal
             components in 2-D too.
-        kirchhoff: what `step.law.stress` gives, where it is known.
+        kirchhoff: result of `step.law.stress`, if known.
 
     Raises:
         ValueError: for "out_of_plane_stress" in 3-D.
-        NotImplementedError: for a law without an out-of-plane stress, where that is needed.
+        NotImplementedError: for a law without an out-of-plane stress, where it is needed.
     """
     if name in MEASURES:
         return stress_field(step, with_C(state), name, kirchhoff)
@@ -54,7 +54,7 @@ def stress_field(step: Step, state: State, name: str, kirchhoff: Tensor | None =
         assert kirchhoff is not None
         return kirchhoff
     J = law.volume_ratio(state)
-    J = torch.where(J > 0, J, 1)  # what is turned inside out has no stress
+    J = torch.where(J > 0, J, 1)  # Inverted particles have no stress.
     if name in ("stress", "cauchy_stress"):
         assert kirchhoff is not None
         return kirchhoff / J[:, None, None]

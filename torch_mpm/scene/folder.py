@@ -1,4 +1,4 @@
-"""The folder of a run: whose it is, who works in it, its record run.json, and disks that are full."""
+"""Folder of a run: ownership, locks, its record run.json, and full disks."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from .scene import Scene
 RUN, CHECKPOINT, LAST_GOOD, LOCK = "run.json", "checkpoint.h5", "last_good.h5", "run.lock"
 SUMMARY = "summary"
 KINDS = {"fingerprint": str, "scene": dict, "folder": str, SUMMARY: dict}
-"""Types of what a record of a run has; of the summary at its end alone."""
+"""Types of the entries of a record of a run, and of its final summary."""
 SUMMARY_NUMBERS = ("frames", "particles", "substeps", "mass_drift", "largest_cfl", "particles_lost")
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 REMEDY = "choose another folder, or remove this one"
@@ -34,10 +34,10 @@ class OutputError(RuntimeError):
 
 
 def claim(folder: Path, fingerprint: str, resume: bool) -> None:
-    """Refuse a folder that holds anything but an unfinished run of this scene that is to be resumed."""
+    """Refuse a folder with anything else than an unfinished run of this scene that is to be resumed."""
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"{folder} is a file; choose a folder for the output")
-    # A lock, and a file that was being built when a run was killed, are nothing yet.
+    # A lock, and a file in progress when a run was killed, do not count.
     if not folder.exists() or all(p.name == LOCK or p.suffix == ".building" for p in folder.iterdir()):
         return
     _check_links(folder)
@@ -54,7 +54,8 @@ def claim(folder: Path, fingerprint: str, resume: bool) -> None:
 
 
 def _check_links(folder: Path) -> None:
-    """Refuse a folder of which a file or a folder is elsewhere: what is received may not name what is read or written.
+    """Refuse a folder with links to files or folders elsewhere: a received folder must not name files to be read or
+    written.
 
     Raises:
         DamagedFileError: for such a link.
@@ -64,7 +65,7 @@ def _check_links(folder: Path) -> None:
 
 
 def finished(folder: Path, fingerprint: str) -> dict[str, Any] | None:
-    """Summary of a complete run of a scene; None where there is none. Empty where a kill kept it from being written.
+    """Summary of a complete run of a scene; None where there is none. Empty where a kill prevented its writing.
 
     Raises:
         DamagedFileError: for a damaged record.
@@ -77,7 +78,7 @@ def finished(folder: Path, fingerprint: str) -> dict[str, Any] | None:
 
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Keep other processes out of a folder, which is made. The lock ends with this process, however it ends.
+    """Create a folder and exclude other processes from it. The lock ends with this process, however it ends.
 
     A file system without locks (some network file systems) does not exclude other processes.
 
@@ -101,7 +102,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def prepare(folder: Path, scene: Scene, layout: Layout, fingerprint: str) -> None:
-    """The record and the empty trajectory of a run, where they are not there yet."""
+    """Write the record and the empty trajectory of a run, where they do not exist."""
     if not (folder / RUN).exists():
         words = json.loads(scene.model_dump_json())
         write_record(folder / RUN, {"fingerprint": fingerprint, "scene": words, "folder": str(scene.folder.resolve())})
@@ -121,7 +122,9 @@ KEPT = "The frames written so far are whole; free some space and add --resume to
 
 @contextlib.contextmanager
 def output_errors(folder: Path, kept: str = KEPT) -> Iterator[None]:
-    """What keeps this process from writing in a folder, as an OutputError; `kept` says what a full disk leaves."""
+    """Errors that prevent this process from writing in a folder, as an OutputError; `kept` names what remains on a full
+    disk.
+    """
     try:
         yield
     except OSError as error:
@@ -138,7 +141,7 @@ def read_run(folder: Path) -> dict[str, Any]:
     """The record of a run: its ``fingerprint``, ``scene``, ``folder`` (of the scene file), and ``summary`` at its end.
 
     Raises:
-        DamagedFileError: for a record that is not as it was written.
+        DamagedFileError: for a record that was changed.
         OSError: for a record that cannot be read.
     """
     path = folder / RUN
@@ -160,7 +163,7 @@ def read_run(folder: Path) -> dict[str, Any]:
 
 
 def _is_summary(words: dict[str, Any]) -> bool:
-    """Whether the numbers of a summary are there and are numbers; times alone where a kill has taken the rest."""
+    """Whether the entries of a summary exist and are numbers; only times where a kill has removed the rest."""
     seconds, energy = words.get("seconds"), words.get("energy", {})
     if not (isinstance(seconds, dict) and isinstance(energy, dict)):
         return False
@@ -171,7 +174,7 @@ def _is_summary(words: dict[str, Any]) -> bool:
 
 
 def record_summary(folder: Path, summary: dict[str, Any]) -> None:
-    """Keep the summary of a run beside its scene in run.json.
+    """Store the summary of a run with its scene in run.json.
 
     Raises:
         OutputError: when the disk is full.
@@ -184,7 +187,7 @@ def load_run(folder: str | Path, overrides: list[str] | None = None) -> Scene:
     """The scene of a run folder, with overrides as for :meth:`Scene.load`.
 
     Raises:
-        FileNotFoundError: when the folder holds no run.
+        FileNotFoundError: when the folder has no run.
         DamagedFileError: when its record is damaged, or its trajectory is that of another scene.
     """
     folder = Path(folder)

@@ -1,4 +1,4 @@
-"""Memory that the C library holds back, returned to the system."""
+"""Release of free memory held by the C library."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from typing import Any
 
 
 def trim() -> None:
-    """Return free memory of the C heap to the system, where the C library can (glibc).
+    """Return free memory of the C heap to the system, where the C library supports it (glibc).
 
-    Tensors are aligned allocations, and glibc before 2.38 seldom reuses what they leave in its heap
-    (https://sourceware.org/bugzilla/show_bug.cgi?id=14581): thousands of steps would grow to any size.
+    Tensors are aligned allocations, and glibc before 2.38 seldom reuses the holes of freed ones
+    (https://sourceware.org/bugzilla/show_bug.cgi?id=14581): memory would grow without bound over thousands of steps.
     """
     if _malloc_trim is not None:
         _malloc_trim(0)

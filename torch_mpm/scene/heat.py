@@ -1,4 +1,4 @@
-"""The thermal words of a scene: materials that depend on temperature, and the `Heat` of the step."""
+"""Thermal words of a scene: temperature-dependent materials, and the `Heat` of the step."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def parameter(words: float | schema.Curve, reference: float) -> float | Table:
 
 
 def thermal(law: laws.Material, words: Any, reference: float) -> laws.Material:
-    """A law with the melting and the expansion of its material."""
+    """Law with the melting and the expansion of its material."""
     liquid = getattr(words, "liquid", None)
     if liquid is not None:
         fluid = laws.WeaklyCompressible(liquid.bulk_modulus, liquid.gamma, parameter(liquid.viscosity, reference))
@@ -89,11 +89,11 @@ def conduction(scene: Any, entries: Sequence[Any], grid: Grid, laws: Sequence[An
     """The `Heat` of a step.
 
     Args:
-        scene, entries: the scene and what fills each domain of its batch.
+        scene, entries: the scene and the content of each domain of its batch.
         grid: the lattice.
         laws: the words of a material of each law of the step.
-        obstacles: those of all scenes.
-        device: of the particles.
+        obstacles: obstacles of all scenes.
+        device: device of the particles.
     """
     words, reference = scene.heat, scene.heat.reference
 

@@ -1,5 +1,5 @@
-"""The obstacles of a batch. Those at one place of the lists of several scenes that are alike but for their numbers are
-one obstacle with numbers per scene.
+"""Obstacles of a batch. Obstacles at the same index of the lists of several scenes that differ in numbers only are one
+obstacle with numbers per scene.
 
 So a thousand scenes with two obstacles each cost as much as one scene with two.
 """
@@ -19,12 +19,12 @@ from ..shapes import Shape
 from .places import obstacle
 
 FAR = 1000.0
-"""Distance of an obstacle from the scenes that do not have it, in diagonals of the domain."""
+"""Distance of an obstacle from the scenes that lack it, in diagonals of the domain."""
 
 
 @dataclass(frozen=True)
 class Together:
-    """An obstacle of some scenes of a batch, and its words in each, None where a scene does not have it."""
+    """Obstacle of some scenes of a batch, and its words in each, None where a scene lacks it."""
 
     boundary: Obstacle
     words: list[Any]
@@ -41,7 +41,7 @@ def obstacles(entries: Sequence[Any], grid: Any, dtype: torch.dtype, device: tor
     Args:
         entries: the scenes.
         grid: words of the domain.
-        dtype, device: of the particles.
+        dtype, device: dtype and device of the particles.
     """
     if len(entries) == 1:
         return [Together(obstacle(words, None), [words]) for words in entries[0].obstacle]
@@ -50,7 +50,7 @@ def obstacles(entries: Sequence[Any], grid: Any, dtype: torch.dtype, device: tor
         for place, words in enumerate(entry.obstacle):
             groups.setdefault((place, _form(words)), [None] * len(entries))[index] = words
     made = []
-    for _, words in sorted(groups.items(), key=lambda item: item[0]):  # one after another as in each scene
+    for _, words in sorted(groups.items(), key=lambda item: item[0]):  # One after another as in each scene.
         having = [k for k, w in enumerate(words) if w is not None]
         if len(having) == 1:
             made.append(Together(obstacle(words[having[0]], having[0]), words))
@@ -60,7 +60,7 @@ def obstacles(entries: Sequence[Any], grid: Any, dtype: torch.dtype, device: tor
 
 
 def _form(words: Any) -> str:
-    """What must be the same in obstacles that are one."""
+    """Properties that merged obstacles must share."""
     kept = (words.shape, words.contact, words.start, words.end, words.held, words.temperature is None)
     return repr((*kept, getattr(words, "outline", None), words.velocity is None, words.spin is None))
 
@@ -117,7 +117,7 @@ def _shape(each: Sequence[Any], values: Any) -> Shape:
 
 
 def _away(shape: Shape, grid: Any) -> list[float]:
-    """A position where a shape touches nothing in the domain."""
+    """Position at which a shape touches nothing in the domain."""
     diagonal = math.dist(grid.lower, grid.upper)
     direction: Iterator[float] = iter([1.0] * len(grid.lower))
     if isinstance(shape, shapes.Plane):

@@ -1,4 +1,4 @@
-"""Further mistakes in a scene that could not be read as a whole: checks of the parts that could."""
+"""Further problems in a scene that could not be read as a whole: checks of the valid parts."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ LISTS = {"body": schema.AnyBody, "obstacle": schema.AnyObstacle, "emitter": sche
 
 
 def problems(words: dict[str, Any]) -> list[str]:
-    """One line for each mistake that can be found in spite of the others; none for a part that could not be read."""
+    """One line for each problem that can be found in spite of the others; none for unreadable parts."""
     names = ("grid", "origin", "duration", "fps", "render", "gravity", "precision")
     scene = schema.SceneData.model_construct(**{name: _field(name, words) for name in names})
     heat = words.get("heat")
@@ -23,7 +23,7 @@ def problems(words: dict[str, Any]) -> list[str]:
 
 
 def file_problems(words: dict[str, Any], folder: Path) -> list[str]:
-    """Files of the bodies that can be read."""
+    """Files of the readable bodies."""
     return list(dict.fromkeys(p for entry in _entries(words) for p in check.file_problems(entry, folder)))
 
 
@@ -36,7 +36,7 @@ def _entries(words: dict[str, Any]) -> list[ResolvedEntry]:
 
 
 def _content(words: dict[str, Any]) -> schema.Entry:
-    """A scene of a batch, or what all share, with None in place of the parts that are wrong."""
+    """Scene of a batch, or the shared part, with None in place of invalid parts."""
     lists: dict[str, Any] = {
         name: [_piece(kind, item) for item in _list(words.get(name))] for name, kind in LISTS.items()
     }
@@ -49,7 +49,7 @@ def _content(words: dict[str, Any]) -> schema.Entry:
 
 
 def _field(name: str, words: dict[str, Any]) -> Any:
-    """The value of a key of the scene, its default where it is absent, None where it is wrong or missing."""
+    """Value of a key of the scene, its default where absent, None where invalid or missing."""
     field = schema.SceneData.model_fields[name]
     if name not in words:
         return None if field.is_required() else field.get_default()

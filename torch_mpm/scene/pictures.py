@@ -22,17 +22,17 @@ from .scene import Scene
 
 FOLDER, VIDEO = "frames", "video.mp4"
 SAMPLES = 8
-"""Frames that decide the colour scale of a run."""
+"""Number of frames that determine the colour scale of a run."""
 
 
 def draw(folder: str | Path, scene: Scene, progress: Any = None) -> list[Path]:
-    """Draw the trajectory in ``folder`` as ``scene.render`` says: frames/00000.png, ..., and video.mp4.
+    """Draw the trajectory in ``folder`` with the settings ``scene.render``: frames/00000.png, ..., and video.mp4.
 
-    Pictures that were drawn in the same way before are kept. Returns the files made; calls ``progress(frame, frames)``
+    Existing pictures of the same settings are reused. Returns the written files; calls ``progress(frame, frames)``
     after each picture.
 
     Raises:
-        FileNotFoundError: when there is no trajectory, or no frame in it yet.
+        FileNotFoundError: when there is no trajectory, or it has no frame yet.
         DamagedFileError: for a trajectory that is damaged.
         SceneError: when `scene.render` does not fit the trajectory.
         ImportError: when a package of the extra ``render`` is missing.
@@ -68,7 +68,7 @@ def draw(folder: str | Path, scene: Scene, progress: Any = None) -> list[Path]:
 
 
 def _problems(scene: Scene, words: schema.Render, trajectory: Trajectory) -> Iterator[str]:
-    """What of a scene with overrides does not fit its trajectory."""
+    """Overrides of a scene that contradict its trajectory."""
     yield from check.render_problems(scene)
     dim = trajectory.file["position"].shape[2]
     if scene.dim != dim:
@@ -121,10 +121,10 @@ class _Artist:
         self._fit_radii(trajectory)
         drawn = scene.model_dump_json(), limits, [renderer.radius for renderer in self.renderers]
         self.way = hashlib.sha256(repr(drawn).encode()).hexdigest()
-        """Hash of everything that decides how a frame is drawn."""
+        """Hash of everything that affects the picture of a frame."""
 
     def _fit_radii(self, trajectory: Trajectory) -> None:
-        """Set the radii from the first frame with particles, whichever picture is drawn first."""
+        """Set the radii from the first frame with particles, for any order of pictures."""
         missing = dict(enumerate(self.renderers))
         for frame in trajectory:
             for k, renderer in list(missing.items()):
@@ -191,12 +191,12 @@ class _Artist:
 
 
 def _rows(k: int, frame: dict[str, Array]) -> Any:
-    """The particles of a scene of the batch."""
+    """Particles of a scene of the batch."""
     return frame["scene"] == k if "scene" in frame else slice(None)
 
 
 def _layers(trajectory: Trajectory, scene: Scene, count: int) -> Array:
-    """Number of the layer of each particle [N]: by height at the start, or by time for what emitters bring."""
+    """Number of the layer of each particle [N]: by height at the start, or by time for emitted particles."""
     start = trajectory.frame(0)["position"]
     total = len(trajectory["mass"])
     up = -np.asarray(scene.gravity or np.eye(scene.dim)[1] * -1.0)

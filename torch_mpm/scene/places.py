@@ -1,4 +1,4 @@
-"""From the words of a scene to the regions that bodies fill, and to obstacles."""
+"""Regions of bodies, and obstacles, from the words of a scene."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from ..shapes import Shape
 from . import schema
 
 PLACES = ("lower", "upper", "center", "a", "b", "offset", "view")
-"""Keys of coordinates [m]; `dam` is one along x."""
+"""Keys of coordinates [m]; `dam` is a single x."""
 
 
 def relative(words: Any, origin: Sequence[float]) -> Any:
-    """Words of a scene, or a part of them, with all coordinates less an origin.
+    """Words of a scene, or a part of them, with all coordinates minus an origin.
 
-    The differences are those of the decimal numbers: a scene far from zero is the same as one near it to the last bit.
+    The differences are those of the decimal numbers: a scene far from zero equals one near it to the last bit.
     """
     if isinstance(words, list):
         return [relative(item, origin) for item in words]
@@ -41,14 +41,14 @@ def _changed(name: str, value: Any, origin: Sequence[float]) -> Any:
 
 
 def _less(value: Any, origin: Sequence[float]) -> Any:
-    """A place, or a tuple of places, relative to an origin."""
+    """Position, or a tuple of positions, relative to an origin."""
     if isinstance(value[0], tuple):
         return tuple(_less(place, origin) for place in value)
     return tuple(float(Decimal(repr(a)) - Decimal(repr(b))) for a, b in zip(value, origin, strict=True))
 
 
 def region(body: schema.Body, folder: Path | None) -> seed.Region | None:
-    """The region of a body; None for points, and without a folder for what is in a file."""
+    """Region of a body; None for points, and without a folder for the content of a file."""
     if isinstance(body, schema.BoxBody):
         return seed.Box(body.lower, body.upper)
     if isinstance(body, schema.SphereBody):
@@ -63,7 +63,7 @@ def region(body: schema.Body, folder: Path | None) -> seed.Region | None:
 
 
 def obstacle(words: Any, scene: int | None) -> Obstacle:
-    """The boundary of the step that an obstacle of a scene names."""
+    """Boundary of the step for an obstacle of a scene."""
     shape, position = _shape(words)
     return boundaries.Obstacle(
         shape,
@@ -80,7 +80,7 @@ def obstacle(words: Any, scene: int | None) -> Obstacle:
 
 
 def _shape(words: Any) -> tuple[Shape, Any]:
-    """The shape of an obstacle, and where its origin is."""
+    """Shape of an obstacle, and the position of its origin."""
     if isinstance(words, schema.PlaneObstacle):
         return shapes.Plane(words.normal), words.center
     if isinstance(words, schema.BoxObstacle):

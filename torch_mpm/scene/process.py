@@ -1,4 +1,4 @@
-"""What a run changes in its process while it lasts: signals, and how soon threads take turns."""
+"""Changes of the process during a run: signals, and the switching interval of threads."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ..interrupts import RaiseLater, alarm
 FRAME_SECONDS = 0.5
 """Time limit of the current frame after a signal [s]; a frame that takes longer is discarded."""
 SWITCH_SECONDS = 1e-4
-"""After which a thread that is busy in Python lets another one go on."""
+"""Switching interval of threads that are busy in Python [s]."""
 
 
 class StopSignals:
@@ -32,7 +32,7 @@ class StopSignals:
         self._previous: dict[int, Any] = {}
 
     def __enter__(self) -> StopSignals:
-        with contextlib.suppress(ValueError):  # not the main thread, which alone may handle signals
+        with contextlib.suppress(ValueError):  # Only the main thread may handle signals.
             for number in (signal.SIGINT, signal.SIGTERM):
                 self._previous[number] = signal.signal(number, self._ask)
         return self
@@ -62,8 +62,9 @@ class StopSignals:
 
 @contextlib.contextmanager
 def prompt_turns() -> Iterator[None]:
-    """Who has waited for a device goes on soon, and gives it work, though the writer is busy: not after the 5 ms of
-    Python, in which a device takes hundreds of substeps."""
+    """Let a thread that has waited for a device continue soon, and launch work, although the writer is busy: not after
+    the default 5 ms of Python, in which a device computes hundreds of substeps.
+    """
     before = sys.getswitchinterval()
     sys.setswitchinterval(min(before, SWITCH_SECONDS))
     try:

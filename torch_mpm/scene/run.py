@@ -34,34 +34,35 @@ from .substeps import check_substeps
 from .writer import Copier, Copies, Frame, FrameWriter
 
 SEGMENT = 32
-"""Substeps between two looks at the stability limit and the validity of the state, and between two reorderings."""
+"""Substeps between two checks of the stability limit and the validity of the state, and between two reorderings."""
 LONGEST_SEGMENT = {"cpu": SEGMENT, "cuda": 512}
-"""While the limit is steady: a GPU waits for each look."""
+"""The same while the limit is steady: a GPU waits at each check."""
 UNSTEADY_SEGMENT = {"cpu": SEGMENT, "cuda": 64}
-"""While it is not; where it was passed, the substeps are taken again in the shortest ones."""
+"""The same while it is not; where it was exceeded, the substeps are recomputed in the shortest segments."""
 STEADY = 1.02
-"""The limit is, where it has become smaller by no larger factor over a segment."""
+"""Largest factor by which a steady limit may decrease over a segment."""
 LIMITS = 8
-"""Segments of whose limits the smallest counts: a dt that followed that of the moment would feed energy into particles
-that oscillate (docs/limitations.md)."""
+"""Number of segments whose smallest limit is used: a dt that followed the present limit would feed energy into
+oscillating particles (docs/limitations.md).
+"""
 
 Progress = Callable[[dict[str, Any]], None]
 
 
 class Interrupted(RuntimeError):
-    """The run was asked to stop, and stopped after a complete frame."""
+    """The run was interrupted, and stopped after a complete frame."""
 
 
 @dataclass
 class Totals:
-    """Figures of the summary, kept in the checkpoint so that a resumed run reports them for the whole run."""
+    """Numbers of the summary, stored in the checkpoint so that a resumed run reports them for the whole run."""
 
     substeps: int = 0
     simulating: float = 0.0
     largest_cfl: float = 0.0
     smallest_dt: float = math.inf
-    segment: int = SEGMENT  # substeps of the next one, at most
-    limits: list[float] = field(default_factory=list)  # of dt in the latest `LIMITS` segments [s]
+    segment: int = SEGMENT  # maximum number of substeps of the next one
+    limits: list[float] = field(default_factory=list)  # limits of dt in the latest `LIMITS` segments [s]
     first: dict[str, Any] = field(default_factory=dict)
 
 
@@ -76,22 +77,22 @@ def run(
     """Simulate ``scene`` into the folder ``out``: trajectory, checkpoint, summary.
 
     Args:
-        scene: what to simulate.
-        out: folder, made where it does not exist.
-        resume: go on with an unfinished run of the same scene; of a complete one, return its summary, which is empty
-            where a kill has kept it from being written.
-        source: text of the scene file, kept in the trajectory; the words of the scene by default.
-        progress: called after each frame with a dictionary of its figures.
+        scene: the scene.
+        out: folder, created where it does not exist.
+        resume: continue an unfinished run of the same scene; for a complete one, return its summary, which is empty
+            where a kill prevented its writing.
+        source: text of the scene file, stored in the trajectory; the words of the scene by default.
+        progress: called after each frame with a dictionary of its numbers.
 
     Returns:
         The summary, also in ``run.json``.
 
     Raises:
         SceneError: for a scene that cannot be simulated.
-        OutputError: for a folder that holds something else or in which another process runs, or a full disk.
-        DamagedFileError: for a run to be resumed whose files are damaged.
-        SceneFailure: for a simulation that went wrong; the state before it is in ``last_good.h5``.
-        Interrupted: after Ctrl-C or SIGTERM, once the frame is whole, or has taken too long to end.
+        OutputError: for a folder with other content or in which another process runs, or a full disk.
+        DamagedFileError: for a run to be resumed with damaged files.
+        SceneFailure: for a failed simulation; the last good state is in ``last_good.h5``.
+        Interrupted: after Ctrl-C or SIGTERM, once the frame is complete, or has taken too long.
     """
     begin = time.perf_counter()
     folder = Path(out)
@@ -107,7 +108,7 @@ def run(
     simulation = Simulation(scene, built)
     layout = simulation.layout(source, fingerprint)
     with StopSignals() as stop, prompt_turns(), output_errors(folder), locked(folder), torch.no_grad():
-        claim(folder, fingerprint, resume)  # again: another process may have been here before the lock
+        claim(folder, fingerprint, resume)  # Again: another process may have worked here before the lock.
         remove_leftovers(folder)
         prepare(folder, scene, layout, fingerprint)
         writer = simulation.open(folder, layout)
@@ -134,36 +135,36 @@ def _remove_rest(folder: Path) -> None:
 
 
 class Shown(NamedTuple):
-    """What a frame has of a state."""
+    """Content of a frame."""
 
     copies: Copies
     sums: dict[str, Any]
 
 
 class Segment(NamedTuple):
-    """Substeps between two looks at the state."""
+    """Substeps between two checks of the state."""
 
     dt: float
     """[s]"""
     steps: int
     until: float
-    """Time at their end [s]."""
+    """Time at the end of the segment [s]."""
     shows: bool
-    """Whether a frame ends with them."""
+    """Whether a frame ends with the segment."""
 
 
 class Moved(NamedTuple):
-    """A state after a segment, in a better order."""
+    """State after a segment, reordered."""
 
     state: State
     survey: list[list[float]]
     status: list[list[float]]
     shown: Shown | None
-    """Where a frame shows it."""
+    """State in the form of a frame."""
 
 
 class Simulation:
-    """The loop over frames. Everything it decides follows from the state at the last frame."""
+    """Loop over frames. All its decisions depend on the state at the last frame only."""
 
     def __init__(self, scene: Scene, built: Built) -> None:
         self.scene, self.built, self.step = scene, built, built.step
@@ -174,16 +175,16 @@ class Simulation:
         self.emitted = 0
         self.fingerprint = ""
         self._figures: dict[str, Any] = {}
-        self._survey: list[list[float]] | None = None  # rates, speeds and wrong particles of the present state
+        self._survey: list[list[float]] | None = None  # Rates, speeds and invalid particles of the present state.
         self._copier = Copier()
-        self._shown: Shown | None = None  # of the present state, at the end of a frame
+        self._shown: Shown | None = None  # Of the present state, at the end of a frame.
         origin = scene.origin
         self._origin = None if origin is None else torch.tensor(origin, dtype=torch.float64, device=self.state.x.device)
 
     # -- output
 
     def layout(self, source: str, fingerprint: str) -> Layout:
-        """What the trajectory of this scene holds."""
+        """Content of the trajectory of this scene."""
         dim, dtype = self.scene.dim, str(self.state.x.numpy(force=True).dtype)
         vector = ((dim,), dtype)
         place = vector if self.scene.origin is None else ((dim,), "<f8")
@@ -235,7 +236,7 @@ class Simulation:
         return FrameWriter(writer, path)
 
     def _restore(self, path: Path, layout: Layout, written: int) -> None:
-        """Take over a checkpoint beside a trajectory of ``written`` frames."""
+        """Load a checkpoint beside a trajectory of ``written`` frames."""
         state, record = checkpoint.load(path, self.state.x.device)
         problem = self._unfit(state, record, layout, written)
         if problem:
@@ -244,11 +245,11 @@ class Simulation:
         self.totals = Totals(**record["totals"])
 
     def _unfit(self, state: State, record: dict[str, Any], layout: Layout, written: int) -> str:
-        """Why a checkpoint cannot be that of this run; "" for one that can."""
+        """Reason why a checkpoint cannot be that of this run; "" if it can."""
         if record.get("fingerprint") != self.fingerprint:
             return "is the checkpoint of another scene"
         frame, emitted, totals = (record.get(name) for name in ("frame", "emitted", "totals"))
-        # Checkpoints follow the frames now and then, and the disk may lack the last count.
+        # Checkpoints are rarer than frames, and the disk may lack the last count.
         if type(frame) is not int or not 0 <= frame < layout.frames or not frame <= written:
             return f"is of frame {frame}, which does not fit the {written} frames of the trajectory"
         known = isinstance(totals, dict) and totals.keys() == vars(self.totals).keys()
@@ -274,7 +275,7 @@ class Simulation:
         return f"has a particle that is not meaningful: {bad[1]}" if bad else ""
 
     def run(self, writer: FrameWriter, progress: Progress | None, stop: StopSignals) -> None:
-        """All frames that are missing. A device has its next substeps before the host hands over the last frame."""
+        """Compute all missing frames. A device gets its next substeps before the host hands over the last frame."""
         due: Frame | None = None
 
         def deliver() -> None:
@@ -299,11 +300,11 @@ class Simulation:
                 begin, before = time.perf_counter(), self.totals.substeps
                 cfl = self._advance(self.scene.time_of(self.frame), self.scene.time_of(self.frame + 1), deliver)
                 due = self._complete(self.totals.substeps - before, cfl, time.perf_counter() - begin)
-        finally:  # also before a failure of what comes after the frame
+        finally:  # Also before a failure in work after the frame.
             deliver()
 
     def _runs_ahead(self) -> bool:
-        """Whether the host goes on while substeps are taken."""
+        """Whether the host continues while substeps are computed."""
         return self.state.x.is_cuda
 
     def _check_stop(self, stop: StopSignals) -> None:
@@ -311,12 +312,12 @@ class Simulation:
             raise self.interrupted()
 
     def interrupted(self) -> Interrupted:
-        """The error of a run that stops now."""
+        """Error of a run that stops now."""
         where = f"after frame {self.frame}" if self.frame >= 0 else "before the first frame"
         return Interrupted(f"stopped {where} of {self.scene.frames}; add --resume to continue")
 
     def _complete(self, substeps: int, cfl: float, seconds: float) -> Frame:
-        """The present state as the next frame, with all that must not change until it is handed over."""
+        """Present state as the next frame, with everything that must not change until it is handed over."""
         assert self._shown is not None
         self.frame += 1
         self.totals.simulating += seconds
@@ -338,7 +339,7 @@ class Simulation:
         return Frame(self.frame, copies, scalars, checkpoint.tensors_of(state), record)
 
     def _show(self, state: State, figures: Figures) -> tuple[Copies, dict[str, Tensor]]:
-        """Copies and sums of a state for the next frame, which are not waited for."""
+        """Copies and sums of a state for the next frame, without waiting for them."""
         given = self.step.prepare(state)
         assert given.ids is not None
         places = torch.arange(len(given), device=given.x.device)
@@ -346,7 +347,7 @@ class Simulation:
         values = {}
         for name in ("position", "velocity", *self.scene.trajectory_fields):
             value = fields.field(self.step, given, name, figures.stress)
-            assert value is not None, name  # `build` refuses fields that no material has
+            assert value is not None, name  # `build` refuses fields that no material has.
             values[name] = self._in_coordinates(value) if name == "position" else value
         kept = dict(zip(values, _take_all(list(values.values()), order), strict=True))
         return self._copier.begin(kept), energies(self.step, state, figures)
@@ -361,9 +362,9 @@ class Simulation:
     # -- time
 
     def _advance(self, begin: float, end: float, meanwhile: Callable[[], None] = lambda: None) -> float:
-        """Move the state to time ``end``; returns the largest CFL number |v| dt / dx on the way.
+        """Advance the state to time ``end``; returns the largest CFL number |v| dt / dx of the substeps.
 
-        ``meanwhile`` is called whenever a device has work that the host would only wait for.
+        ``meanwhile`` is called whenever the host would otherwise only wait for a device.
         """
         now, largest = begin, 0.0
         rounding = 1e-9 * (end - begin)
@@ -409,7 +410,7 @@ class Simulation:
         return span / count, count
 
     def _most_after(self, rates: list[float]) -> int:
-        """Substeps of the next segment, at most, after one that began with these limits."""
+        """Maximum number of substeps of the next segment, after one that began with these limits."""
         assert self._survey is not None
         before, after = max(rates, default=0.0), max(self._survey[0], default=0.0)
         device = self.state.x.device.type
@@ -418,11 +419,11 @@ class Simulation:
         return min(2 * self.totals.segment, LONGEST_SEGMENT[device])
 
     def _take(self, segment: Segment, meanwhile: Callable[[], None]) -> bool:
-        """Take a segment, and check the state at its end; a failure is located by repeating the substeps.
+        """Compute a segment, and check the state at its end; a failure is located by repeating the substeps.
 
         Returns:
-            Whether they were taken: a segment longer than SEGMENT in which something went wrong, or whose dt was above
-            the limit at its end, was not, since with shorter ones dt would have followed.
+            Whether the segment was accepted: a segment longer than SEGMENT with a failure, or with a dt above the limit
+            at its end, is rejected, since in shorter ones dt would have followed the limit.
         """
         good, dt, steps = self.state, segment.dt, segment.steps
         try:
@@ -447,9 +448,9 @@ class Simulation:
         raise SceneFailure(str(failure or message), failure)
 
     def _moved(self, segment: Segment, meanwhile: Callable[[], None]) -> Moved:
-        """The state after a segment; taken again where the pool of blocks was too small, which follows on CUDA.
+        """State after a segment; recomputed where the pool of blocks was too small, which grows later on CUDA.
 
-        A device has all of its work before the only wait for it, that of a frame too.
+        All work of a device is launched before the only wait for it, including that of a frame.
         """
         room = self.step.grid.max_blocks
         end = rollout(self.step, self.state, segment.steps, segment.dt).replace(time=segment.until)
@@ -468,13 +469,15 @@ class Simulation:
         return Moved(ordered, survey, status, None if copies is None else Shown(copies, found))
 
     def _overflowed(self, status: list[list[float]], room: int | None) -> bool:
-        """Whether a pool of blocks that follows the scene, with some room before a segment, was too small for it."""
+        """Whether a pool of blocks that grows with the scene, with some margin before a segment, was too small for
+        it.
+        """
         grid = self.step.grid
         if not status or not grid.grows or room is None:
             return False
         wanted = int(status[0][Status.BLOCKS_WANTED])
         grid.follow(wanted)
-        # Calls of the rollout that had more room have no problem.
+        # Calls of the rollout with a larger pool have no problem.
         return wanted > room and status[0][Status.PROBLEM_ACTIVATION] >= 0
 
     def _emit(self, until: float) -> None:
@@ -489,7 +492,7 @@ class Simulation:
     # -- the end
 
     def summary(self, writer: FrameWriter, seconds: float) -> dict[str, Any]:
-        """Run times of the run, and how well conserved quantities were conserved."""
+        """Run times of the run, and errors of conserved quantities."""
         first, last = self.totals.first, self._figures
         energy = [sum(v for k, v in values.items() if k.endswith("energy")) for values in (first, last)]
         layers = [self.built.nozzles[k].layer.mass for _, k in self.emissions[: self.emitted]]
@@ -515,7 +518,7 @@ class Simulation:
 
 
 def joined(state: State, layer: State) -> State:
-    """A state with more particles, which appear now."""
+    """State with additional particles, which appear now."""
     return State.concatenate([state, layer.replace(time=state.time)])
 
 
@@ -537,7 +540,7 @@ def energies(step: Any, state: Any, figures: Figures) -> dict[str, Tensor]:
 
 
 def on_host(tensors: Mapping[str, Tensor]) -> dict[str, Any]:
-    """Tensors on one device as numbers in float64, lists and lists of these, after one wait for the device."""
+    """Tensors on one device as numbers in float64, lists and nested lists, after one wait for the device."""
     numbers = torch.cat([t.double().flatten() for t in tensors.values()]).cpu().numpy()
     ends = accumulate(t.numel() for t in tensors.values())
     return {
@@ -559,7 +562,7 @@ def versions() -> dict[str, str]:
 
 
 def _save_last_good(folder: Path, state: State, failure: SceneFailure) -> str:
-    """Keep the last good state of a run that failed; says where it is."""
+    """Store the last good state of a failed run; returns its path."""
     path = folder / LAST_GOOD
     record = {"time": float(state.time), "failure": str(failure)}
     try:

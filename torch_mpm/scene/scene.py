@@ -30,7 +30,7 @@ COSMETIC = {"title", "device", "render", "output"}
 
 
 class Scene(schema.SceneData):
-    """What to simulate. ``Scene.load("examples/jelly.toml")``, or the keys of a scene file as arguments:
+    """Scene to simulate. ``Scene.load("examples/jelly.toml")``, or the keys of a scene file as arguments:
 
         scene = mpm.Scene(
             grid=dict(lower=(0, 0), upper=(1, 1), dx=0.02),
@@ -42,7 +42,7 @@ class Scene(schema.SceneData):
         scene.run("out/jelly")
 
     Raises:
-        SceneError: a ValueError with one line for each thing that is wrong.
+        SceneError: a ValueError with one line for each problem.
     """
 
     _folder: Path = PrivateAttr(default=Path())
@@ -65,7 +65,7 @@ class Scene(schema.SceneData):
             overrides: ``key=value`` with keys such as ``grid.dx`` or ``body[0].velocity`` and values as in TOML.
 
         Raises:
-            SceneError: for what is wrong in the file, with its name.
+            SceneError: for problems in the file, with its name.
             FileNotFoundError: when there is no such file.
         """
         path = Path(path)
@@ -80,8 +80,8 @@ class Scene(schema.SceneData):
         Args:
             words: the keys of a scene file.
             overrides: as for :meth:`load`; set in ``words``.
-            folder: where relative file names start.
-            source: name of the file that the words are from, for messages.
+            folder: folder to which file names are relative.
+            source: name of the file of the words, for messages.
         """
         try:
             for item in overrides or []:
@@ -97,12 +97,12 @@ class Scene(schema.SceneData):
 
     @property
     def folder(self) -> Path:
-        """Where relative file names start."""
+        """Folder to which file names are relative."""
         return self._folder
 
     @property
     def source(self) -> str:
-        """Name of the file that the scene was read from, for messages; "" for a scene made in Python."""
+        """Name of the file that the scene was read from, for messages; "" for a scene created in Python."""
         return self._source
 
     @property
@@ -120,7 +120,9 @@ class Scene(schema.SceneData):
 
     @property
     def trajectory_fields(self) -> list[str]:
-        """Fields of the trajectory beside position and velocity: those asked for, and what the other outputs need."""
+        """Fields of the trajectory beside position and velocity: requested ones, and those that the other outputs
+        need.
+        """
         drawn = self.render.color_by if self.render else ""
         needed = {"stress": "von_mises_stress"}.get(drawn, drawn)
         names = {*self.output.fields, *([needed] if needed in RANKS else [])}
@@ -152,23 +154,24 @@ class Scene(schema.SceneData):
         return [ResolvedEntry.resolved(entry, self, k) for k, entry in enumerate(self.scene)]
 
     def relative(self) -> Scene:
-        """The same scene with all coordinates relative to its origin, which is its own zero then."""
+        """The same scene with all coordinates relative to its origin, which becomes zero."""
         if self.origin is None:
             return self
         moved: Scene = relative(self, self.origin).model_copy(update={"origin": None})
         return moved
 
     def fingerprint(self) -> str:
-        """Hash of everything that determines the trajectory, files included.
+        """Hash of everything that determines the trajectory, including files.
 
         Raises:
             SceneError: for a file that cannot be read.
         """
-        absent = {"origin"} if self.origin is None else set()  # as in files of versions without this key
+        absent = {"origin"} if self.origin is None else set()  # As in files of versions without this key.
         digest = hashlib.sha256(self.model_dump_json(exclude=COSMETIC | absent).encode())
         names = self.trajectory_fields
         digest.update(json.dumps(names).encode())
-        digest.update(MEASURES["stress"].encode() if "stress" in names else b"")  # which was another one once
+        # Its default was different in earlier versions.
+        digest.update(MEASURES["stress"].encode() if "stress" in names else b"")
         entries = self.entries()
         problems = [p for entry in entries for p in check.file_problems(entry, self.folder)]
         if problems:
@@ -187,7 +190,7 @@ class Scene(schema.SceneData):
                 than memory holds, ...
         """
         try:
-            with on_host():  # where a scene is put together, whatever torch's default device
+            with on_host():  # A scene is assembled on the CPU, for any default device of torch.
                 return build(self, self.torch_device() if device is None else torch.device(device))
         except SceneError as error:
             raise SceneError(error.problems, self.source) from None
@@ -203,7 +206,7 @@ def parsed(path: Path) -> tuple[str, dict[str, Any]]:
     """Text and words of a TOML file.
 
     Raises:
-        SceneError: for what is wrong in the file, with its name.
+        SceneError: for problems in the file, with its name.
         FileNotFoundError: when there is no such file.
     """
     try:
@@ -221,7 +224,7 @@ def override(words: dict[str, Any], text: str) -> None:
     """Set a value of nested dictionaries by ``key=value``, as for `Scene.load`.
 
     Raises:
-        SceneError: for another text, or a key that is not there.
+        SceneError: for another text, or an unknown key.
     """
     key, equals, value = text.partition("=")
     steps = [s for part in key.strip().split(".") for s in part.replace("]", "").split("[")]

@@ -1,4 +1,4 @@
-"""How many substeps a scene takes, before they are taken."""
+"""Number of substeps of a scene, before the simulation."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from .explain import SceneError
 from .scene import Scene
 
 MOST_SUBSTEPS = 10**9
-"""Substeps of a scene: more take months."""
+"""Maximum number of substeps of a scene: more take months."""
 
 
 def check_substeps(scene: Scene, built: Built) -> int:
-    """About how many substeps a scene takes.
+    """Approximate number of substeps of a scene.
 
     Raises:
-        SceneError: for more than `MOST_SUBSTEPS`, which would never end.
+        SceneError: for more than `MOST_SUBSTEPS`, which would take too long.
     """
     dt, substeps = time_step(scene, built, built.state)
     if substeps <= MOST_SUBSTEPS:
@@ -29,6 +29,6 @@ def check_substeps(scene: Scene, built: Built) -> int:
 
 
 def time_step(scene: Scene, built: Built, state: State) -> tuple[float, float]:
-    """Time step [s] in a state, and number of substeps of the scene with it; infinite where there is no step."""
+    """Time step [s] of a state, and number of substeps of the scene with it; infinite without a time step."""
     dt = float(built.step.stable_dt(state, scene.cfl).min()) if scene.dt is None else scene.dt
     return dt, max(float(scene.frames), scene.duration / dt if dt > 0 else math.inf)

@@ -1,4 +1,4 @@
-"""Frames and checkpoints are copied from the device while it computes, and written by a thread of their own."""
+"""Frames and checkpoints: copied from the device while it computes, and written by a separate thread."""
 
 from __future__ import annotations
 
@@ -20,13 +20,14 @@ from ..data.trajectory import TrajectoryWriter
 from . import checkpoint
 
 CHECKPOINT_SECONDS = 1.0
-"""Least time from one checkpoint to the next: what a killed run may have to compute again."""
+"""Minimum time between two checkpoints [s]: the work that a killed run may have to recompute."""
 
 
 @dataclass(frozen=True)
 class Copies:
-    """Fields of a frame in host memory. ``ready`` comes behind the copies; ``sources`` keeps their origin alive until
-    then."""
+    """Fields of a frame in host memory. ``ready`` is recorded after the copies; ``sources`` keeps their origin alive
+    until then.
+    """
 
     fields: Mapping[str, Tensor]
     ready: torch.cuda.Event | None
@@ -34,13 +35,13 @@ class Copies:
 
 
 class Copier:
-    """Copies tensors into host memory: on CUDA on a stream of their own, so that nothing waits."""
+    """Copies of tensors into host memory: on CUDA on a separate stream, so that nothing waits."""
 
     def __init__(self) -> None:
         self._stream: Any = None
 
     def begin(self, fields: Mapping[str, Tensor]) -> Copies:
-        """Copies that may not have been made yet."""
+        """Copies that may be pending."""
         sources = list(fields.values())
         device = sources[0].device
         if device.type != "cuda":
@@ -56,17 +57,18 @@ class Copier:
 
 
 def _pinned(t: Tensor) -> Tensor:
-    """Room for a tensor in pinned memory, row after row, as files have it."""
+    """Buffer for a tensor in pinned memory, row after row, as in files."""
     return torch.empty(t.shape, dtype=t.dtype, device="cpu", pin_memory=True)
 
 
 _stream_of = functools.cache(torch.cuda.Stream)
-"""The stream of a device for copies of checkpoints: one alone, since torch hands out 32 streams in turn, and work of
-another thread on a stream that is captured would go into its graph."""
+"""Stream of a device for copies of checkpoints: only one, since torch hands out 32 streams in turn, and work of another
+thread on a stream during capture would enter its graph.
+"""
 
 
 def _copied(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Tensors that a device has made, in host memory: on a stream of their own, so that this thread alone waits."""
+    """Tensors of a device in host memory: on a separate stream, so that only this thread waits."""
     device = next(iter(tensors.values())).device
     with torch.cuda.stream(_stream_of(device)) if device.type == "cuda" else contextlib.nullcontext():
         return {name: t.cpu() for name, t in tensors.items()}
@@ -74,8 +76,9 @@ def _copied(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 @dataclass(frozen=True)
 class Frame:
-    """One frame: copies of its fields in id order, its scalars, and for a checkpoint its state on the device, of which
-    the record says the rest."""
+    """One frame: copies of its fields in id order, its scalars, and for a checkpoint its state on the device; the
+    record describes the rest.
+    """
 
     number: int
     copies: Copies
@@ -85,11 +88,12 @@ class Frame:
 
 
 class FrameWriter:
-    """Queue of frames for a trajectory and its checkpoint; at most two wait, so that memory stays bounded: frames in
+    """Queue of frames for a trajectory and its checkpoint; at most two are queued, so that memory is bounded: frames in
     pinned memory, and their states, which stay on the device until there is a checkpoint.
 
-    A frame is counted in the trajectory first and a checkpoint follows now and then, so a kill repeats the frames since
-    with the same bytes. What ends otherwise before its last frame leaves a checkpoint of the frame that it came to.
+    A frame is counted in the trajectory first and checkpoints are rarer, so after a kill the frames since are
+    recomputed with the same bytes. A run that ends otherwise before its last frame leaves a checkpoint of its latest
+    frame.
     """
 
     def __init__(self, trajectory: TrajectoryWriter, checkpoint_path: Path) -> None:
@@ -98,7 +102,7 @@ class FrameWriter:
         self.seconds = 0.0
         self.waited = 0.0
         self._saved = time.perf_counter()
-        self._unsaved: Frame | None = None  # the latest frame, where it has no checkpoint
+        self._unsaved: Frame | None = None  # The latest frame, where it has no checkpoint.
         self._finished = self._failed = False
         self._error: BaseException | None = None
         self._frames: queue.Queue[Frame | None] = queue.Queue(maxsize=2)
@@ -109,7 +113,7 @@ class FrameWriter:
         """Queue a frame.
 
         Raises:
-            OSError: what went wrong with an earlier frame.
+            OSError: an error of an earlier frame.
         """
         begin = time.perf_counter()
         self._raise()
@@ -117,16 +121,16 @@ class FrameWriter:
         self.waited += time.perf_counter() - begin
 
     def close(self, finished: bool = False) -> None:
-        """Wait for all frames and close the trajectory; `finished` where no checkpoint is wanted any more.
+        """Wait for all frames and close the trajectory; `finished` where no checkpoint is needed any more.
 
         Raises:
-            OSError: what went wrong with a frame.
+            OSError: an error of a frame.
         """
         begin = time.perf_counter()
         self._finished = finished
         self._frames.put(None)
         self._thread.join()
-        self._unsaved = None  # pinned memory must not outlive CUDA
+        self._unsaved = None  # Pinned memory must not outlive CUDA.
         self.trajectory.close()
         self.waited += time.perf_counter() - begin
         self._raise()
@@ -144,7 +148,7 @@ class FrameWriter:
             self._attempt(self._save, self._unsaved)
 
     def _attempt(self, action: Callable[[Frame], None], frame: Frame) -> None:
-        """An action whose error the next call of the main thread raises."""
+        """Action whose error is raised by the next call of the main thread."""
         begin = time.perf_counter()
         try:
             action(frame)
@@ -164,6 +168,6 @@ class FrameWriter:
             self._save(frame)
 
     def _save(self, frame: Frame) -> None:
-        with contextlib.suppress(torch.AcceleratorError):  # whose state is lost, and which the run fails with
+        with contextlib.suppress(torch.AcceleratorError):  # Its state is lost, and the run fails with it.
             checkpoint.save(self.checkpoint_path, _copied(frame.state), frame.record)
         self._saved, self._unsaved = time.perf_counter(), None

@@ -55,7 +55,7 @@ def set_velocity_on_cuboid(
     end_time: float = FOREVER,
     reset: bool = False,
 ) -> None:
-    """Velocity of the nodes in a box of half edges `size` that stays where it is, while start ≤ time ≤ end.
+    """Velocity of the nodes in a box at rest of half edges `size`, while start ≤ time ≤ end.
 
     With `reset` they are at rest before, and for 15 steps after that.
     """
@@ -73,7 +73,7 @@ def add_surface_collider(
     start_time: float = 0.0,
     end_time: float = FOREVER,
 ) -> None:
-    """Nodes behind a plane stop ("sticky"), lose their normal velocity ("slip") or turn it round ("collide").
+    """Nodes behind a plane stop ("sticky"), lose their normal velocity ("slip") or reverse it ("collide").
 
     `friction` is not used, as in MPM-PyTorch.
     """
@@ -90,8 +90,9 @@ def add_surface_collider(
 def add_sdf_collider(
     model: MPMSolver, bound: float, dim: int, start_time: float = 0.0, end_time: float = FOREVER
 ) -> None:
-    """Before P2G, move particles on axis `dim` between `bound` and 1 − `bound` [m], and add what they were moved by
-    over dt to their velocity."""
+    """Before P2G, move particles on axis `dim` between `bound` and 1 − `bound` [m], and add the displacement over dt to
+    their velocity.
+    """
     if dim not in (0, 1, 2):
         raise ValueError(f"dim must be 0, 1 or 2, got {dim}")
     refuse_grad("it is a number of the condition", bound=bound, start_time=start_time, end_time=end_time)
@@ -110,7 +111,7 @@ def add_impulse_on_particles(
     """A force [N] on each particle that starts in a box of half edges `size`, for num_dt steps."""
     refuse_grad("it selects particles", dt=dt, point=point, size=size, num_dt=num_dt, start_time=start_time)
     inside = in_box(model.init_pos, point, size)
-    given, share = vector("force", force, model.init_pos), dt / model.dt  # v changes by `dt` of the argument
+    given, share = vector("force", force, model.init_pos), dt / model.dt  # v changes by `dt` of the argument.
     scaled = given * share if isinstance(given, Tensor) else [f * share for f in given]
     model.pre_particle_process.append(Push(scaled, start_time, start_time + num_dt * model.dt, inside))
 
@@ -135,8 +136,9 @@ def enforce_particle_velocity_rotation(
     start_time: float,
     end_time: float,
 ) -> None:
-    """Turn the particles that start in a cylinder about its axis, at −rotation_scale [rad/s] about `normal`, and move
-    them along it at translation_scale [m/s]. (MPM-PyTorch's own raises an error when it is called.)"""
+    """Rotate the particles that start in a cylinder about its axis, at −rotation_scale [rad/s] about `normal`, and move
+    them along it at translation_scale [m/s]. (The original function of MPM-PyTorch raises an error when it is called.)
+    """
     selecting = {"half_height_and_radius": half_height_and_radius, "start_time": start_time, "end_time": end_time}
     refuse_grad("it selects particles", **selecting)
     point, normal = vector("point", point, model.init_pos), vector("normal", normal, model.init_pos)
@@ -156,7 +158,7 @@ CONDITIONS: dict[str, Callable[..., None]] = {
 
 
 class Projection(Timed):
-    """What `add_sdf_collider` does; the solver moves particles by its `displacement` at the end of the step."""
+    """Condition of `add_sdf_collider`; the solver moves particles by its `displacement` at the end of the step."""
 
     def __init__(self, solver: MPMSolver, bound: float, dim: int, start: float, end: float) -> None:
         super().__init__(start, end)
@@ -174,7 +176,7 @@ class Projection(Timed):
 
 
 class NodeVelocity(TensorModule):
-    """What `set_velocity_on_cuboid` does."""
+    """Condition of `set_velocity_on_cuboid`."""
 
     def __init__(self, point: Numbers, size: Numbers, velocity: Numbers, start: float, end: float, reset: bool) -> None:
         self.point, self.size = ([float(a) for a in v] for v in (point, size))
@@ -195,7 +197,7 @@ class NodeVelocity(TensorModule):
 
 
 class Reflection(nn.Module):
-    """Turns the normal velocity of the nodes behind a "slip" plane round: what slips has lost half of that change."""
+    """Reverses the normal velocity of the nodes behind a "slip" plane, which has removed half of that change."""
 
     def __init__(self, plane: Plane) -> None:
         super().__init__()

@@ -1,6 +1,6 @@
 """Times of calls of a solver, for calls that `torch.utils.checkpoint` recomputes in the backward pass.
 
-A solver that counts its own time cannot give a recomputed call the time of the first one. A recomputed call gets the
+A solver that counts its own time cannot know the time of the first call in a recomputed one. A recomputed call gets the
 same tensors, or tensors that share their storage, so the time is stored by storage. Within a recomputed function of
 several calls, the result of one call has the time of the next.
 """
@@ -16,9 +16,9 @@ from torch.multiprocessing.reductions import StorageWeakRef
 from ...capture import is_traced, version
 
 Moment = tuple[float, int]
-"""Time [s], and how often the conditions had changed."""
+"""Time [s], and number of changes of the conditions."""
 LEAST_ENTRIES = 256
-"""Entries from which on those of freed storages are removed."""
+"""Number of entries from which on those of freed storages are removed."""
 
 
 def is_recomputed() -> bool:
@@ -46,7 +46,7 @@ class CallTimes:
             self._limit = max(2 * len(self._entries), LEAST_ENTRIES)
 
     def of(self, tensors: Iterable[Tensor]) -> frozenset[Moment]:
-        """Moments at which all of these tensors that are known were arguments; empty where none is known."""
+        """Moments at which all known ones of these tensors were arguments; empty where none is known."""
         known = [found for t in tensors if _has_storage(t) and (found := self._of(_key(t), t._version))]
         return frozenset.intersection(*known) if known else frozenset()
 

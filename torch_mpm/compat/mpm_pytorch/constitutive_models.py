@@ -25,9 +25,9 @@ __all__ = [
 
 
 class _Model(nn.Module):
-    """A model with buffers `log_E` [1] and `nu` [1], for which a call may give others, [] or [P].
+    """Model with buffers `log_E` [1] and `nu` [1], which a call may override, [] or [P].
 
-    Arguments must not require grad: assign a tensor that does to the attribute of the model.
+    Arguments must not require grad: assign a tensor that requires grad to the attribute of the model.
     """
 
     log_E: Tensor
@@ -48,7 +48,7 @@ class _Model(nn.Module):
         return constitutive.lame(E.reshape(-1), nu.reshape(-1))
 
     def forward(self, F: Tensor, log_E: Tensor | None = None, nu: Tensor | None = None) -> Tensor:
-        """Of F [P, 3, 3]; `log_E` and `nu`, [] or [P], take the place of the model's own."""
+        """Result for F [P, 3, 3]; `log_E` and `nu`, [] or [P], override those of the model."""
         raise NotImplementedError
 
 
@@ -84,7 +84,7 @@ class SigmaElasticity(Elasticity):
 
 
 class StVKElasticity(Elasticity):
-    """μ F (Fᵀ F − 1) + λ J (J − 1), as it stands in MPM-PyTorch."""
+    """μ F (Fᵀ F − 1) + λ J (J − 1), as in MPM-PyTorch."""
 
     def forward(self, F: Tensor, log_E: Tensor | None = None, nu: Tensor | None = None) -> Tensor:
         return constitutive.stvk(F, *self.moduli(log_E, nu))
@@ -119,7 +119,7 @@ class IdentityPlasticity(Plasticity):
 
 
 class SigmaPlasticity(Plasticity):
-    """A fluid's: J^(1/3) 1 with J between 0.05 and 1.2."""
+    """Fluid: J^(1/3) 1 with J between 0.05 and 1.2."""
 
     def forward(self, F: Tensor, log_E: Tensor | None = None, nu: Tensor | None = None) -> Tensor:
         return constitutive.isochoric_reset(F, 0.05, 1.2)
@@ -148,7 +148,7 @@ class DruckerPragerPlasticity(Plasticity):
     Args:
         E, nu: as for `Elasticity`.
         friction_angle: [degrees]
-        cohesion: strain on every axis at the apex of the cone.
+        cohesion: strain along every axis at the apex of the cone.
     """
 
     friction_angle: Tensor

@@ -19,9 +19,9 @@ from ..node_conditions import NodeDamping
 from .call_times import CallTimes, is_recomputed
 
 LARGEST_ENTRY = 2.0
-"""To which entries of F are clamped."""
+"""Bound to which entries of F are clamped."""
 RESET_STEPS = 15
-"""Steps for which a cuboid with `reset` stops its nodes after its end."""
+"""Number of steps for which a cuboid with `reset` stops its nodes after its end."""
 
 
 class MPMSolver:
@@ -33,19 +33,19 @@ class MPMSolver:
     Every particle has the volume prod(size)/P and the density rho. Gradients pass to all five tensors, which may be
     float32 or float64.
 
-    The solver counts its own `time`, at which conditions act. A call that `torch.utils.checkpoint` recomputes has the
-    time of the first call, and leaves that of the solver as it is.
+    The solver counts its own `time`, at which conditions act. A call that `torch.utils.checkpoint` recomputes uses the
+    time of the first call, and does not change that of the solver.
 
     Args:
-        init_pos: positions [P, 3] [m] by which boundary conditions choose particles; this has no gradient.
+        init_pos: positions [P, 3] [m] by which boundary conditions select particles; without gradient.
         rho: density [kg/m³]: a number, or a tensor [] or [P] that may require grad.
         num_grids: cells along each axis.
         dt: time step [s].
-        gravity: [m/s²]: three numbers, or a tensor [3] that may require grad.
-        clip_bound: distance that positions keep from the faces of the cube, in cells.
+        gravity: acceleration [m/s²]: three numbers, or a tensor [3] that may require grad.
+        clip_bound: minimum distance of positions from the faces of the cube, in cells.
         damping: factor of all node velocities in each step, in [0, 1].
         center: not used.
-        size: edges of the box whose volume the particles share [m].
+        size: edges of the box whose volume is divided among the particles [m].
         enable_train: not used: gradients pass where a tensor requires them.
         device: None for that of init_pos.
 
@@ -92,7 +92,7 @@ class MPMSolver:
             stress_form="gradient",
         )
         self._acting: tuple[list[Any], list[Any]] | None = None
-        self._changes = 0  # of the lists of conditions
+        self._changes = 0  # Lengths of the lists of conditions.
         self._volume = torch.full((self.n_particles,), self.vol, dtype=torch.float64, device=self.device)
 
     def reset(self) -> None:
@@ -108,7 +108,7 @@ class MPMSolver:
     def p2g2p(
         self, x: Tensor, v: Tensor, C: Tensor, F: Tensor, stress: Tensor, time: float | None = None
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The particles a time step later.
+        """Particles a time step later.
 
         Args:
             x: positions [P, 3] [m].
@@ -116,15 +116,15 @@ class MPMSolver:
             C: affine velocity field [P, 3, 3] [1/s].
             F: deformation gradient [P, 3, 3].
             stress: Kirchhoff stress [P, 3, 3] [Pa].
-            time: at the start of the step [s]; by default that of the solver, or of the call that is recomputed.
+            time: time at the start of the step [s]; by default that of the solver, or of the recomputed call.
 
         Returns:
             x, v, C and F.
 
         Raises:
             TypeError, ValueError: for a wrong argument.
-            RuntimeError: for a call in a backward pass whose time is not known, and whose conditions depend on it, or
-                whose conditions have changed since.
+            RuntimeError: for a call in a backward pass with an unknown time on which its conditions depend, or with
+                conditions that have changed since.
         """
         check_like("x", x, x, (self.n_particles, 3), "[P, 3]")
         self._set_boundaries()
@@ -150,7 +150,7 @@ class MPMSolver:
         return result
 
     def _recomputed_time(self, arguments: tuple[Tensor, ...]) -> float:
-        """The time of the call that is recomputed; that of the solver where no condition depends on it."""
+        """Time of the recomputed call; that of the solver where no condition depends on it."""
         known = self._times.of(arguments)
         if known and all(changes != self._changes for _, changes in known):
             raise RuntimeError("conditions of the solver must stay as they are until the backward pass of a checkpoint")
@@ -166,7 +166,7 @@ class MPMSolver:
         return last
 
     def _set_boundaries(self) -> None:
-        """Give the step what was added to the lists since the last one."""
+        """Add the new conditions of the lists to the step."""
         lists = (list(self.pre_particle_process), list(self.post_grid_process))
         if self._acting == lists:
             return
@@ -180,6 +180,6 @@ class MPMSolver:
 def _may_change(condition: Any, first: float, last: float, dt: float) -> bool:
     """Whether a condition may begin or end between two times."""
     if not (hasattr(condition, "start") and hasattr(condition, "end")):
-        return True  # a function of the user
+        return True  # A user function.
     ends = (condition.end, condition.end + RESET_STEPS * dt)
     return first < condition.start <= last or any(first <= end <= last for end in ends)

@@ -1,6 +1,7 @@
 """NCLaw's laws: modules F -> stress and F -> F after plastic flow, and the networks that learn them.
 
-Each takes a configuration, an object or a mapping with its parameters. Stress is P Fᵀ, the Kirchhoff stress [Pa].
+The argument of each is a configuration, an object or a mapping with its parameters. Stress is P Fᵀ, the Kirchhoff
+stress [Pa].
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ class Material(nn.Module):
         self.svd = SVD()
 
     def transpose(self, F: Tensor) -> Tensor:
-        """Of matrices [P, 3, 3]."""
+        """Transpose of matrices [P, 3, 3]."""
         return F.mT
 
     def forward(self, F: Tensor) -> Tensor:
@@ -48,7 +49,7 @@ class Plasticity(Material):
 
 
 class ComposeMaterial(Material):
-    """Several laws, each for the particles of a section.
+    """Several laws, each for the particles of one section.
 
     Args:
         materials: the laws.
@@ -99,7 +100,7 @@ class CorotatedElasticity(_Moduli, Elasticity):
 
 
 class StVKElasticity(_Moduli, Elasticity):
-    """μ F (Fᵀ F − 1) + λ J (J − 1), as it stands in NCLaw. Configuration: E [Pa], nu, random."""
+    """μ F (Fᵀ F − 1) + λ J (J − 1), as in NCLaw. Configuration: E [Pa], nu, random."""
 
     def forward(self, F: Tensor) -> Tensor:
         return constitutive.stvk(F, *self.moduli())
@@ -134,7 +135,7 @@ class IdentityPlasticity(Plasticity):
 
 
 class SigmaPlasticity(Plasticity):
-    """A fluid's: J^(1/3) 1."""
+    """Fluid: J^(1/3) 1."""
 
     def forward(self, F: Tensor) -> Tensor:
         return constitutive.isochoric_reset(F)
@@ -235,7 +236,7 @@ class _Network(Material):
         return polar(F).R.to(M.dtype) @ ((M + M.mT) / 2) if self.rotated else M
 
     def less(self, value: Tensor, rest: float | Tensor) -> Tensor:
-        """A feature less its value at rest, where inputs are normalised."""
+        """A feature minus its value at rest, where inputs are normalised."""
         return value - rest if self.normalize_input else value
 
 
@@ -302,15 +303,15 @@ class PlainMetaElasticity(_Plain, _NetworkElasticity):
 
 
 class PolarMetaElasticity(_Polar, _NetworkElasticity):
-    """A network of S, turned by R."""
+    """A network of S, rotated by R."""
 
 
 class InvariantMetaElasticity(_Invariant, _NetworkElasticity):
-    """A network of three invariants, turned by R."""
+    """A network of three invariants, rotated by R."""
 
 
 class InvariantFullMetaElasticity(_InvariantFull, _NetworkElasticity):
-    """A network of σ, FᵀF and det F, turned by R: that of the paper."""
+    """A network of σ, FᵀF and det F, rotated by R: that of the paper."""
 
 
 class PlainMetaPlasticity(_Plain, _NetworkPlasticity):
@@ -318,11 +319,11 @@ class PlainMetaPlasticity(_Plain, _NetworkPlasticity):
 
 
 class PolarMetaPlasticity(_Polar, _NetworkPlasticity):
-    """A network of S, turned by R."""
+    """A network of S, rotated by R."""
 
 
 class InvariantFullMetaPlasticity(_InvariantFull, _NetworkPlasticity):
-    """A network of σ, FᵀF and det F, turned by R: that of the paper. Its inputs are always normalised."""
+    """A network of σ, FᵀF and det F, rotated by R: that of the paper. Its inputs are always normalised."""
 
     def __init__(self, cfg: Any) -> None:
         super().__init__(cfg)

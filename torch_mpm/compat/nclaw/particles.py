@@ -1,4 +1,4 @@
-"""The particles of NCLaw's simulator: what moves, what stays, and how both begin."""
+"""Particles of NCLaw's simulator: moving fields, constant fields, and their initial values."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FIELDS = ("x", "v", "C", "F", "stress")
 
 
 class MPMStatics:
-    """What particles do not change in a step.
+    """Fields of particles that a step does not change.
 
     Args:
         shape: number of particles.
@@ -31,7 +31,7 @@ class MPMStatics:
     Attributes:
         vol: rest volume [P] [m³].
         rho: density [P] [kg/m³].
-        clip_bound: distance that positions keep from the faces of the cube, in cells [P].
+        clip_bound: minimum distance of positions from the faces of the cube, in cells [P].
         enabled: whether a particle takes part, int32 [P].
     """
 
@@ -57,7 +57,7 @@ class MPMStatics:
 
 
 def _by_section(like: Tensor, sections: Sequence[int], values: Sequence[float | Tensor]) -> Tensor:
-    """Values [P] of sections with a value each, a number or a tensor [] that may require grad."""
+    """Values [P] of sections with one value each, a number or a tensor [] that may require grad."""
     if len(sections) != len(values) or sum(sections) != len(like):
         raise ValueError(f"sections must add up to {len(like)} with one value each, got {list(sections)}")
     if not values:
@@ -136,7 +136,7 @@ class MPMInitData:
 
     @classmethod
     def get(cls, cfg: Any) -> MPMInitData:
-        """Of a configuration with rho, clip_bound, span and a shape of type "cube".
+        """Body of a configuration with rho, clip_bound, span and a shape of type "cube".
 
         Raises:
             ValueError: for another shape, which `torch_mpm.seed` fills: MPMInitData(..., pos=points.x.numpy()).
@@ -209,14 +209,14 @@ class _Initializer:
 
 
 class MPMStateInitializer(_Initializer):
-    """Makes the first state of bodies.
+    """Creates the first state of bodies.
 
     Args:
         model: see `MPMModelBuilder`.
     """
 
     def finalize(self) -> tuple[MPMState, list[int]]:
-        """The state, and the number of particles of each body."""
+        """State, and the number of particles of each body."""
         state = self.model.state(sum(self.sections))
         for name, parts in (("x", [g.pos for g in self.groups]), ("v", [g.velocity() for g in self.groups])):
             rows = np.concatenate(parts) if parts else np.zeros((0, 3))
@@ -225,14 +225,14 @@ class MPMStateInitializer(_Initializer):
 
 
 class MPMStaticsInitializer(_Initializer):
-    """Makes the statics of bodies.
+    """Creates the statics of bodies.
 
     Args:
         model: see `MPMModelBuilder`.
     """
 
     def finalize(self) -> MPMStatics:
-        """The statics at step 0."""
+        """Statics at step 0."""
         statics, sections = self.model.statics(sum(self.sections)), self.sections
         statics.update_vol(sections, [g.vol for g in self.groups])
         statics.update_rho(sections, [g.rho for g in self.groups])
@@ -241,5 +241,5 @@ class MPMStaticsInitializer(_Initializer):
         return statics
 
     def update(self, statics: MPMStatics, step: int = 0) -> None:
-        """Enable the bodies that are there at a step."""
+        """Enable the bodies that are present at a step."""
         statics.update_enabled(self.sections, [g.span for g in self.groups], step)

@@ -1,4 +1,4 @@
-"""NCLaw's simulator: MLS-MPM on the unit cube with a stress that is given, on a `Step` of torch_mpm."""
+"""NCLaw's simulator: MLS-MPM on the unit cube with a given stress, on a `Step` of torch_mpm."""
 
 from __future__ import annotations
 
@@ -33,19 +33,19 @@ __all__ = [
 ]
 
 Particles = tuple[Tensor, Tensor, Tensor, Tensor]
-"""x, v, C and F."""
+"""State of x, v, C and F."""
 
 
 class MPMModel:
-    """The numbers of a simulation; `MPMModelBuilder` makes it.
+    """Parameters of a simulation, created by `MPMModelBuilder`.
 
     Args:
         num_grids: cells along each axis of the unit cube.
         dt: time step [s].
         bound: nodes with an index below it, or above num_grids − bound, have no velocity out of the cube.
-        gravity: [m/s²]: three numbers, or a tensor [3] that may require grad.
-        eps: added to the mass of a node [kg], which makes light nodes slow.
-        device: of the particles that it makes.
+        gravity: acceleration [m/s²]: three numbers, or a tensor [3] that may require grad.
+        eps: added to the mass of a node [kg], which slows down light nodes.
+        device: device of new particles.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class MPMModel:
         return state, self._enabled
 
     def advance(self, statics: MPMStatics, x: Tensor, v: Tensor, C: Tensor, F: Tensor, stress: Tensor) -> Particles:
-        """The particles a time step later. Those that are not enabled stay as they are."""
+        """Particles a time step later. Particles that are not enabled are unchanged."""
         if not isinstance(statics, MPMStatics):
             raise TypeError(f"statics must be an MPMStatics, got {shape_of(statics)}")
         volume = statics.vol.to(x)
@@ -98,7 +98,7 @@ class MPMModel:
 
 
 class HeavyNodes(TensorModule):
-    """Node velocities of NCLaw's grid step from those of a step without gravity and walls.
+    """Node velocities of NCLaw's grid step, from those of a step without gravity and walls.
 
     Args:
         eps: [kg], see `MPMModel`.
@@ -123,7 +123,7 @@ class HeavyNodes(TensorModule):
 
 
 class MPMModelBuilder:
-    """Makes a model of a configuration: `MPMModelBuilder().parse_cfg(cfg).finalize(device, requires_grad=True)`."""
+    """Creates a model of a configuration: `MPMModelBuilder().parse_cfg(cfg).finalize(device, requires_grad=True)`."""
 
     def __init__(self) -> None:
         self.config: dict[str, Any] = {}
@@ -145,14 +145,14 @@ class MPMModelBuilder:
         return self
 
     def finalize(self, device: Any = None, requires_grad: bool = False) -> MPMModel:
-        """The model. Gradients pass wherever a tensor requires them, whatever `requires_grad` says."""
+        """Model of the configuration. Gradients pass wherever a tensor requires them, for any `requires_grad`."""
         if not self.config:
             raise ValueError("there is no configuration: call parse_cfg first")
         return MPMModel(**self.config, device=None if device is None else str(device))
 
 
 class MPMSim(nn.Module):
-    """What the simulators have in common.
+    """Common base of the simulators.
 
     Args:
         model: see `MPMModelBuilder`.
@@ -179,7 +179,7 @@ class MPMDiffSim(MPMSim):
 
 
 class MPMCacheDiffSim(MPMSim):
-    """`x, v, C, F = sim(statics, step, x, v, C, F, stress)`; nothing is kept between calls, whatever num_steps is.
+    """`x, v, C, F = sim(statics, step, x, v, C, F, stress)`; nothing is stored between calls, for any num_steps.
 
     Args:
         model: see `MPMModelBuilder`.
@@ -197,7 +197,7 @@ class MPMCacheDiffSim(MPMSim):
 
 
 class MPMForwardSim(MPMSim):
-    """`x, v, C, F = sim(statics, state)`, which also become those of the state, without gradients.
+    """`x, v, C, F = sim(statics, state)`, also stored in the state, without gradients.
 
     Raises:
         ValueError: for a tensor that requires grad, where gradients are enabled.

@@ -1,4 +1,4 @@
-"""The singular value decomposition of NCLaw, with finite gradients."""
+"""Singular value decomposition of NCLaw, with finite gradients."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from torch import Tensor, nn
 from ...ops.svd import svd3
 
 NEAR = 0.5
-"""Exponent of the rounding error: stretches whose relative gap is below count as equal."""
+"""Exponent of the rounding error: stretches with a smaller relative gap are treated as equal."""
 
 
 class SVD(nn.Module):
     """F [P, 3, 3] -> U, σ and Vᵀ with rotations U and V; the smallest σ has the sign of det F.
 
-    Gradients are finite at equal stretches, and right for functions of σ and of R = U Vᵀ, such as the stress of NCLaw's
-    networks. What turns the axes of two equal stretches together is left out there: for U diag(f(σ)) Uᵀ and
-    U diag(f(σ)) Vᵀ use `torch_mpm.isotropic`, whose gradients are right everywhere.
+    Gradients are finite at equal stretches, and correct for functions of σ and of R = U Vᵀ, such as the stress of
+    NCLaw's networks. The common rotation of the axes of two equal stretches is neglected there: for U diag(f(σ)) Uᵀ and
+    U diag(f(σ)) Vᵀ use `torch_mpm.isotropic`, whose gradients are correct everywhere.
     """
 
     def forward(self, F: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -27,8 +27,9 @@ class SVD(nn.Module):
 
 
 class _Decomposition(torch.autograd.Function):
-    """With a = skew Uᵀ ∂U, b = skew Vᵀ ∂V: U and V turn together by (a + b)/2 over the gap of two stretches, against
-    each other by (a − b)/2 over their sum, which is all that R sees."""
+    """With a = skew Uᵀ ∂U, b = skew Vᵀ ∂V: U and V rotate together by (a + b)/2 over the gap of two stretches, and
+    against each other by (a − b)/2 over their sum, on which alone R depends.
+    """
 
     @staticmethod
     def forward(F: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -1,4 +1,4 @@
-"""JSON configurations of PhysGaussian: their defaults, and the boundary conditions that they list."""
+"""JSON configurations of PhysGaussian: defaults and boundary conditions."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ CONDITIONS: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
         (),
     ),
 }
-"""Of each type in a configuration the method of the simulator, the keys that it must have and those that it may."""
+"""For each type of a configuration: method of the simulator, required keys and optional keys."""
 OTHER_CONDITIONS = {
     "add_constant_force": "MotionPhysics has it: use particle_impulse with num_dt",
     "release_particles_sequentially_size": "PhysFlow has it: use release_particles_sequentially",
@@ -83,9 +83,9 @@ OTHER_CONDITIONS = {
 def decode_param_json(
     json_file: str | Path,
 ) -> tuple[dict[str, Any], Any, dict[str, Any], dict[str, Any], dict[str, Any]]:
-    """The parts of a configuration with their defaults.
+    """Parts of a configuration with their defaults.
 
-    Keys of descendants for their training and pictures are left out with a warning.
+    Keys of descendants for their training and pictures are ignored with a warning.
 
     Returns:
         Parameters of `set_parameters_dict`; the list of boundary conditions; substep_dt, frame_dt [s] and frame_num;

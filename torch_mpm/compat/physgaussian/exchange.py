@@ -1,4 +1,4 @@
-"""The tensors that PhysGaussian's simulator takes and gives."""
+"""Input and output tensors of PhysGaussian's simulator."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from ...state import State
 
 
 class Exchange:
-    """Imports and exports of the particles of a simulator, whose substeps are taken first."""
+    """Imports and exports of the particles of a simulator, after its pending substeps."""
 
     _state: State | None
     _covariance: Tensor | None
 
     def _flush(self) -> None:
-        """Take the substeps that were asked for."""
+        """Compute the pending substeps."""
         raise NotImplementedError
 
     def _loaded(self) -> State:
@@ -32,7 +32,7 @@ class Exchange:
 
     @property
     def state(self) -> State:
-        """The particles as torch_mpm has them; may be assigned."""
+        """Particles as a state of torch_mpm; may be assigned."""
         return self._flushed()
 
     @state.setter
@@ -47,7 +47,7 @@ class Exchange:
         self._state = state.replace(**{name: value.to(state.x).reshape(len(state), *rows)})
 
     def import_particle_x_from_torch(self, tensor_x: Tensor | None, clone: bool = True, device: Any = None) -> None:
-        """Positions [P, 3] [m]. Gradients pass; nothing is written to a tensor that was given."""
+        """Positions [P, 3] [m]. Gradients pass; given tensors are not written to."""
         self._import("x", tensor_x, (3,))
 
     def import_particle_v_from_torch(self, tensor_v: Tensor | None, clone: bool = True, device: Any = None) -> None:

@@ -18,13 +18,13 @@ if TYPE_CHECKING:
     from ...state import State
 
 LEAST_STRETCH = 0.01
-"""Below which a stretch counts as this one in logarithms."""
+"""Lower bound of a stretch in logarithms."""
 NORM_OFFSET = 1e-6
 """Added to the norm of the strain deviator in the von Mises return maps."""
 
 
 class StretchPlasticity(Material):
-    """A return map in the logarithms of the stretches, with parameters as numbers or tensors [] or [P].
+    """Return map in the logarithms of the stretches, with parameters as numbers or tensors [] or [P].
 
     Args:
         E, nu: Young's modulus [Pa] and Poisson's ratio.
@@ -38,7 +38,7 @@ class StretchPlasticity(Material):
             store(self, name, value)
 
     def initial(self, name: str, state: State) -> Tensor:
-        """History begins as the parameter of its name; what has none is one."""
+        """History begins with the parameter of its name; without one, with one."""
         start = evaluate(name, getattr(self, name), state) if name in self._named else 1.0
         return torch.zeros_like(state.mass) + start
 
@@ -63,7 +63,7 @@ class Metal(StretchPlasticity):
 
     Args:
         E, nu, yield_stress: [Pa], -, [Pa]: numbers or tensors [] or [P].
-        xi: ξ, where it hardens, likewise; 0 if it does not.
+        xi: ξ, likewise; 0 without hardening.
     """
 
     extra_fields = ("yield_stress",)
@@ -104,7 +104,7 @@ class Foam(StretchPlasticity):
         mu, lam = self._moduli(state)
         limit = math.sqrt(2 / 3) * self._column("yield_stress", state)
         viscosity = self._column("plastic_viscosity", state)
-        dt = getattr(state, "dt", 0.0)  # outside of a step nothing flows
+        dt = getattr(state, "dt", 0.0)  # Outside a step there is no flow.
 
         def flow(sigma: Tensor) -> tuple[Tensor, Tensor]:
             clamped, mean, deviator = _deviator(sigma)
@@ -125,7 +125,7 @@ class Plasticine(StretchPlasticity):
     """Von Mises plasticity as `Metal` that softens and breaks, with fixed corotated stress.
 
     State: state.extra["yield_stress"], which falls by the plastic strain times `softening`, and state.extra["intact"],
-    zero from the step on in which that has reached zero: the particle has no stress any more.
+        zero from the step on in which the yield stress has reached zero: the particle then has no stress.
 
     Args:
         E, nu, yield_stress: [Pa], -, [Pa]: numbers or tensors [] or [P].
@@ -162,7 +162,7 @@ class Plasticine(StretchPlasticity):
 
 
 def _deviator(sigma: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Stretches that are not too small [P, D], and the mean [P, 1] and the deviator [P, D] of their logarithms."""
+    """Stretches bounded from below [P, D], and the mean [P, 1] and the deviator [P, D] of their logarithms."""
     clamped = sigma.clamp_min(LEAST_STRETCH)
     strain = clamped.log()
     mean = strain.mean(1, keepdim=True)
@@ -170,7 +170,7 @@ def _deviator(sigma: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _von_mises(sigma: Tensor, mu: Any, limit: Tensor) -> tuple[Tensor, Tensor]:
-    """Stretches [P, D] where |dev 2 μ ε| ≤ limit, and by how much the strain was beyond it, [P, 1]."""
+    """Stretches [P, D] with |dev 2 μ ε| ≤ limit, and the excess of the strain, [P, 1]."""
     _, mean, deviator = _deviator(sigma)
     size = norm(deviator)[:, None]
     stiffness = 2 * mu * torch.ones_like(size)
@@ -188,10 +188,11 @@ def _stretched_hencky(sigma: Tensor, mu: Any, lam: Any) -> Tensor:
 
 
 def law_of(parameters: Mapping[str, Any]) -> Material:
-    """The law of the parameters that a simulator was given, under the names of `set_parameters_dict`.
+    """Law of the parameters of a simulator, under the names of `set_parameters_dict`.
 
     Raises:
-        ValueError, TypeError: for snow, which has no stress there, an unknown material, or one that lacks a parameter.
+        ValueError, TypeError: for snow, which has no stress in PhysGaussian, an unknown material, or one that lacks a
+            parameter.
     """
     kind = parameters.get("material", "jelly")
     if isinstance(kind, Material):

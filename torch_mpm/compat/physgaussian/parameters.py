@@ -1,4 +1,6 @@
-"""Parameters of `set_parameters_dict`: their ranges, which material needs and uses which, and keys of descendants."""
+"""Parameters of `set_parameters_dict`: ranges, required and optional parameters of each material, and keys of
+descendants.
+"""
 
 from __future__ import annotations
 
@@ -25,12 +27,12 @@ RANGES: dict[str, tuple[str, Callable[[Any], Any]]] = {
     "rpic_damping": ("finite and at most 1", lambda v: v <= 1),
     "grid_v_damping_scale": (NOT_NEGATIVE, lambda v: v >= 0),
 }
-"""Of each parameter its range in words, and whether it holds."""
+"""Range of each parameter in words, and its test."""
 OF_THE_WHOLE = ("rpic_damping", "grid_v_damping_scale")
 """Parameters without a value per particle."""
 KNOWN = (*RANGES, "material", "grid_lim", "n_grid", "hardening", "g", "additional_material_params")
 WITHOUT_EFFECT = ("pic_damping", "opacity_threshold")
-"""Keys that PhysGaussian's `decode_param_json` puts among the parameters, and its simulator does not read."""
+"""Keys that PhysGaussian's `decode_param_json` stores among the parameters, and its simulator does not read."""
 BOX = ("point", "size", "E", "nu", "density")
 
 LAW = "give a law as material, such as torch_mpm.Viscoelastic"
@@ -55,7 +57,7 @@ USED: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "foam": (("E", "nu", "yield_stress"), ("plastic_viscosity",)),
     "plasticine": (("E", "nu", "yield_stress"), ("softening", "hardening", "xi")),
 }
-"""Of each material the parameters that it needs, and those that it uses where they are given."""
+"""Required and optional parameters of each material."""
 OF_LAWS = ("E", "nu", "yield_stress", "hardening", "xi", "friction_angle", "plastic_viscosity", "softening")
 OTHER_MATERIALS = {
     **{"elastic": "PhysFlow's; 'jelly' is elastic", "neo-hookean": "PhysDreamer's; give torch_mpm.NeoHookean"},
@@ -67,7 +69,7 @@ OTHER_MATERIALS = {
 
 
 def checked(name: str, value: Any, like: Tensor) -> Any:
-    """A parameter as number, or as tensor in the dtype and on the device of a tensor of particles [P, ...].
+    """Parameter as a number, or as a tensor in the dtype and on the device of a particle tensor [P, ...].
 
     Raises:
         TypeError, ValueError: for a wrong type, shape or range, or a gradient that it cannot have.
@@ -105,7 +107,7 @@ def _in_range(name: str, value: Any, like: Tensor) -> float | Tensor:
 
 
 def check_material(material: Any, parameters: Mapping[str, Any]) -> None:
-    """Check that a material is known and has all that it needs.
+    """Check that a material is known and has all required parameters.
 
     Raises:
         TypeError: for an unknown material.
@@ -131,7 +133,7 @@ def check_material(material: Any, parameters: Mapping[str, Any]) -> None:
 
 
 def check_gradients(parameters: Mapping[str, Any], effective: Collection[str], material: str) -> None:
-    """Check that what requires grad has an effect on a material.
+    """Check that parameters that require grad have an effect on a material.
 
     Raises:
         ValueError: for a parameter of laws that is not among those with an effect, and requires grad.

@@ -1,4 +1,4 @@
-"""What only PhysGaussian's simulator does to particles."""
+"""Operations on particles specific to PhysGaussian's simulator."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..gradients import Numbers
 from ..selections import in_box
 
 LAYERS = 50
-"""Of a sequential release."""
+"""Number of layers of a sequential release."""
 
 
 class WithoutAffine(Timed):
@@ -25,7 +25,7 @@ class WithoutAffine(Timed):
 
 
 class DampedAffine(Timed):
-    """RPIC: the symmetric part of C less a share, a number or a tensor [] that may require grad."""
+    """RPIC: the symmetric part of C minus a share, a number or a tensor [] that may require grad."""
 
     def __init__(self, share: float | Tensor) -> None:
         super().__init__()
@@ -37,7 +37,7 @@ class DampedAffine(Timed):
 
 
 def release_times(x: Tensor, normal: Numbers, start: float, end: float, end_time: float) -> Tensor:
-    """When each particle is let go [P] [s]; at once where it is in no layer.
+    """Release time of each particle [P] [s]; immediate where it is in no layer.
 
     Layer k of n holds the particles nearer to `end` than (n − k)/n of the way from `start` until (k + 1)/n of the time,
     and on the axes without a normal those within 1 m of 1 m.

@@ -31,17 +31,17 @@ from .surfaces import Cut
 PADDING = 3
 """Nodes at each face of the domain on which a bounding box acts."""
 RESET_STEPS = 15
-"""Steps for which a cuboid with `reset` holds all nodes after its end."""
+"""Number of steps for which a cuboid with `reset` holds all nodes after its end."""
 FOREVER = 999.0
 
 
 class MPM_Simulator_WARP(Exchange):
     """Explicit MPM on the cube [0, grid_lim]³ with forces by the gradient of quadratic B-splines and APIC.
 
-    Substeps asked for with `p2g2p` are taken together when something is read or changed, in one op where that is
-    possible. Gradients pass from the exports to the tensors that were given: positions, velocities, parameters, forces
-    and velocities of conditions. An argument that has no gradient, such as the size of a box, must not require grad.
-    Tensors stay in their dtype, float32 or float64, and on their device.
+    Substeps requested by `p2g2p` are computed together when something is read or changed, in one op where possible.
+    Gradients pass from the exports to the given tensors: positions, velocities, parameters, forces and velocities of
+    conditions. An argument that has no gradient, such as the size of a box, must not require grad. Tensors keep their
+    dtype, float32 or float64, and their device.
 
     Args:
         n_particles: not used before data are loaded.
@@ -59,21 +59,21 @@ class MPM_Simulator_WARP(Exchange):
     def initialize(
         self, n_particles: int, n_grid: int = 100, grid_lim: float = 1.0, device: torch.device | str | None = None
     ) -> None:
-        """Forget everything but the size of the grid."""
+        """Discard everything except the size of the grid."""
         self.n_particles = n_particles
         size = {"n_grid": n_grid, "grid_lim": grid_lim}
         self.parameters: dict[str, Any] = {name: checked(name, value, torch.empty(0)) for name, value in size.items()}
         self._state: State | None = None
         self._step: Step | None = None
         self._law: Material | None = None
-        self._moduli: dict[str, Any] | None = None  # E and nu of the last finalize_mu_lam
+        self._moduli: dict[str, Any] | None = None  # E and nu of the last finalize_mu_lam.
         self._covariance: Tensor | None = None
         self._damping: NodeDamping | None = None
         self._nodes: list[Any] = []
         self._acting: list[Any] = []
         self._pushes: list[Any] = []
         self._holds: list[Any] = []
-        self._queue: list[Any] = [0, 0.0, True]  # substeps, dt, whether gradients are wanted
+        self._queue: list[Any] = [0, 0.0, True]  # Substeps, dt, whether gradients are needed.
 
     # ---- data
 
@@ -92,7 +92,7 @@ class MPM_Simulator_WARP(Exchange):
             tensor_x: positions [P, 3] [m] in [0, grid_lim].
             tensor_volume: [P] [m³].
             tensor_cov: covariance of a Gaussian on each particle, six numbers xx xy xz yy yz zz: [P, 6] or [6 P].
-            n_grid, grid_lim, device: as of the class.
+            n_grid, grid_lim, device: as for the class.
         """
         if not isinstance(tensor_x, Tensor) or tensor_x.dim() != 2 or tensor_x.shape[1] != 3:
             raise ValueError(f"tensor_x must have shape [P, 3], got {shape_of(tensor_x)}")
@@ -125,7 +125,7 @@ class MPM_Simulator_WARP(Exchange):
     def set_parameters_dict(
         self, kwargs: Mapping[str, Any] | None = None, device: torch.device | str | None = None
     ) -> None:
-        """Material and numbers of the simulation; what is not given stays as it was.
+        """Set material and numbers of the simulation; others are unchanged.
 
         Args:
             kwargs: material ("jelly", "metal", "sand", "foam", "plasticine", or a `torch_mpm.Material`), E [Pa], nu,
@@ -176,7 +176,7 @@ class MPM_Simulator_WARP(Exchange):
         return value.expand(len(state))
 
     def finalize_mu_lam(self, device: torch.device | str | None = None) -> None:
-        """Make the material of E and nu as they are now.
+        """Create the material with the present E and nu.
 
         Raises:
             TypeError, ValueError: for a material that is unknown, or that lacks a parameter.
@@ -202,10 +202,10 @@ class MPM_Simulator_WARP(Exchange):
         start_time: float = 0.0,
         end_time: float = FOREVER,
     ) -> None:
-        """Stop the nodes behind a plane, whatever `surface` says: so does the simulator that this class stands for.
+        """Stop the nodes behind a plane, for any `surface`, as the original simulator does.
 
-        A surface that slips, separates or has friction is `add_boundary(torch_mpm.Plane(...))`. "cut" is that
-        simulator's own, with heights that are fixed.
+        A surface that slips, separates or has friction is `add_boundary(torch_mpm.Plane(...))`. "cut" is specific to
+        that simulator, with fixed heights.
         """
         refuse_grad("it selects nodes", point=point, normal=normal, start_time=start_time, end_time=end_time)
         refuse_grad("it has no effect", friction=friction)
@@ -242,14 +242,14 @@ class MPM_Simulator_WARP(Exchange):
             self.add_boundary(FreezeOutside(start_time, end_time, RESET_STEPS))
 
     def add_bounding_box(self, start_time: float = 0.0, end_time: float = FOREVER) -> None:
-        """Let nothing out of the domain: no node within 3 of a face moves outwards."""
+        """Close the domain: no node within 3 of a face moves outwards."""
         refuse_grad("it selects nodes", start_time=start_time, end_time=end_time)
         n, dx = self.parameters["n_grid"], self._dx
         for plane in outer_planes((PADDING - 1) * dx, (n - PADDING) * dx, 3, start_time, end_time):
             self.add_boundary(plane)
 
     def add_boundary(self, boundary: Any) -> None:
-        """Append anything with the interface of `torch_mpm.boundaries`."""
+        """Append an object with the interface of `torch_mpm.boundaries`."""
         self._flush()
         self._nodes.append(boundary)
 
@@ -295,8 +295,9 @@ class MPM_Simulator_WARP(Exchange):
         end_time: float,
         device: torch.device | str | None = None,
     ) -> None:
-        """Turn the particles that are now in a cylinder about its axis, at −rotation_scale [rad/s] about `normal`, and
-        move them along it at translation_scale [m/s]."""
+        """Rotate the particles that are now in a cylinder about its axis, at −rotation_scale [rad/s] about `normal`,
+        and move them along it at translation_scale [m/s].
+        """
         selecting = {"half_height_and_radius": half_height_and_radius, "start_time": start_time, "end_time": end_time}
         refuse_grad("it selects particles", **selecting)
         x = self._flushed().x
@@ -313,8 +314,9 @@ class MPM_Simulator_WARP(Exchange):
         start_time: float,
         end_time: float,
     ) -> None:
-        """Hold the particles between two positions on an axis at rest, and let them go layer by layer, those at
-        `end_position` last. There are 50 layers, whatever num_layers says: so does the simulator."""
+        """Hold the particles between two positions on an axis at rest, and release them layer by layer, those at
+        `end_position` last. There are 50 layers, for any num_layers, as in the original simulator.
+        """
         times = {"start_time": start_time, "end_time": end_time, "num_layers": num_layers}
         refuse_grad(
             "it selects particles", normal=normal, start_position=start_position, end_position=end_position, **times
@@ -358,7 +360,7 @@ class MPM_Simulator_WARP(Exchange):
             raise ValueError("the particles have no mass: give density in set_parameters_dict")
 
     def _flush(self) -> None:
-        """Take the substeps that were asked for."""
+        """Compute the pending substeps."""
         (steps, dt, grad), self._queue = self._queue, [0, 0.0, True]
         if steps == 0:
             return
@@ -369,13 +371,13 @@ class MPM_Simulator_WARP(Exchange):
 
     @property
     def step(self) -> Step:
-        """The step of torch_mpm that the substeps take; `simulator.step.check()` tells what went wrong."""
+        """Step of torch_mpm of the substeps; `simulator.step.check()` reports errors."""
         self._flushed()
         self._check_ready()
         return self._ready_step(self._start_time, math.inf, 0.0)
 
     def _ready_step(self, first: float, last: float, dt: float) -> Step:
-        """The step with what acts at times from `first` to `last`."""
+        """Step with the conditions that are active at times from `first` to `last`."""
         acting = [b for b in self._nodes if _acts(b, first, last, dt)]
         if self._damping is not None:
             acting.insert(0, self._damping)
@@ -406,7 +408,7 @@ class MPM_Simulator_WARP(Exchange):
 
 
 def _affine(damping: float | Tensor) -> list[Timed]:
-    """What `rpic_damping` does to C."""
+    """Operation of `rpic_damping` on C."""
     if isinstance(damping, Tensor) and damping.requires_grad:
         return [DampedAffine(damping)]
     share = float(damping)
@@ -414,7 +416,7 @@ def _affine(damping: float | Tensor) -> list[Timed]:
 
 
 def _acts(boundary: Any, first: float, last: float, dt: float) -> bool:
-    """Whether something on the nodes acts at a time from `first` to `last`."""
+    """Whether a condition on the nodes is active at a time from `first` to `last`."""
     if isinstance(boundary, Obstacle):
         return boundary.start <= last and first < boundary.end
     return boundary.acts_within(first, last, dt) if isinstance(boundary, FreezeOutside) else True

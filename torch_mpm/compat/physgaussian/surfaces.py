@@ -14,7 +14,7 @@ KEPT = 0.3
 
 
 class Cut(nn.Module):
-    """Stops the nodes behind a plane, but for those between two heights z, which keep 0.3 of v_x and v_z."""
+    """Stops the nodes behind a plane, except those between two heights z, which retain 0.3 of v_x and v_z."""
 
     def __init__(self, point: Numbers, normal: Numbers, margin: float, start: float, end: float) -> None:
         super().__init__()
