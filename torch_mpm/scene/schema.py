@@ -44,7 +44,7 @@ class Grid(Model):
     kernel: Literal["quadratic", "cubic"] = "quadratic"
     """B-spline of the transfers between particles and nodes"""
     walls: Wall | list[Wall | tuple[Wall, Wall]] | None = "slip"
-    """what the faces of the domain do: one kind, or a list with one kind or pair (lower, upper) per axis; a mirror is a
+    """kind of the walls: one for all faces, or a list with one kind or pair (lower, upper) per axis; a mirror is a
     frictionless wall of second order, and needs a domain of a whole or half-integer number of cells"""
     friction: NotNegative = 0.0
     """Coulomb friction coefficient of the walls"""
@@ -88,7 +88,7 @@ class Thermal(Model):
 
 
 class Liquid(Model):
-    """What a solid becomes when it melts: a fluid whose pressure follows its volume."""
+    """Molten material: a fluid whose pressure depends on its volume."""
 
     bulk_modulus: Positive
     """bulk modulus [Pa]"""
@@ -110,11 +110,11 @@ class NeoHookean(Thermal):
     nu: Annotated[float, Field(gt=-1, lt=0.5)] = 0.3
     """Poisson's ratio, between -1 and 0.5"""
     liquid: Liquid | None = None
-    """the fluid that it becomes above its melting point"""
+    """fluid above the melting point"""
 
 
 class WeaklyCompressible(Thermal):
-    """Fluid whose pressure follows its volume."""
+    """Fluid whose pressure depends on its volume."""
 
     law: Literal["weakly_compressible"] = "weakly_compressible"
     """name of the law"""
@@ -148,15 +148,15 @@ class QuarticSand(Thermal):
     energy: Literal["unilateral", "full", "hencky", "mixed"] = "unilateral"
     """elastic energy; unilateral: quartic without tension, hencky: quadratic"""
     apex: Literal["zero", "keep"] = "zero"
-    """strain of sand that comes apart: none, or, with the unilateral energy, that of the expansion (keep)"""
+    """strain of separated sand: zero, or, with the unilateral energy, that of the expansion (keep)"""
     smallest_strain: NotNegative = 0.05
-    """least strain that the time step is chosen for; best the compression of the deepest sand"""
+    """minimum strain for which the time step is chosen; ideally the compression of the deepest sand"""
     flow: Literal["radial", "exact"] = "radial"
     """plastic flow; exact: along the deviator of the stress, with more friction in plane strain"""
     cohesion: NotNegative = 0.0
     """logarithmic strain at which the sand tears; 0 for dry sand"""
     volume_correction: bool = False
-    """sand that has come apart has no stress until it has regained its volume"""
+    """separated sand has no stress until it has regained its volume"""
     hardening: Annotated[list[float], Field(min_length=4, max_length=4)] | None = None
     """h0, h1, h2, h3 of the friction angle h0 + (h1 q - h3) exp(-h2 q) after plastic flow q, instead of friction_angle;
     h0, h1 and h3 in degrees, for example [35, 9, 0.2, 10]"""
@@ -171,7 +171,7 @@ class QuarticSand(Thermal):
         if self.apex == "keep" and self.energy != "unilateral":
             raise ValueError("apex = 'keep' needs energy = 'unilateral'")
         if self.hardening is not None:
-            # Not by model_fields_set: an entry of a batch is made of all fields of the file.
+            # Not by model_fields_set: an entry of a batch has all fields of the file.
             if self.friction_angle != type(self).model_fields["friction_angle"].default:
                 raise ValueError("takes friction_angle or hardening, got both")
             h0, h1, h2, h3 = self.hardening
@@ -181,7 +181,7 @@ class QuarticSand(Thermal):
 
 
 class Solid(Thermal):
-    """What the laws in principal strains share."""
+    """Common keys of the laws in principal strains."""
 
     law: str
     """name of the law"""
@@ -203,7 +203,7 @@ def _range(quantity: Quantity) -> Any:
 
 
 def _descriptions(law: type) -> dict[str, str]:
-    """What the docstring of a law says of each argument."""
+    """Descriptions of the arguments in the docstring of a law."""
     text = inspect.getdoc(law) or ""
     _, _, arguments = text.partition("Args:\n")
     found = re.findall(r"^    (\w+): (.*(?:\n        .*)*)", arguments.partition("\n\n")[0], re.MULTILINE)
@@ -235,7 +235,7 @@ SOLIDS = tuple(
     and issubclass(law, laws.SolidLaw)
     and law not in (laws.SolidLaw, laws.NeoHookean, laws.QuarticSand)
 )
-"""Tables of the solids that need no words of their own here: a new class in torch_mpm.laws is one of them."""
+"""Tables of the solids without a separate model here; they include every new class in torch_mpm.laws."""
 
 Material: Any = Annotated[
     functools.reduce(operator.or_, SOLIDS, NeoHookean | WeaklyCompressible | QuarticSand),
@@ -377,7 +377,7 @@ class Obstacle(Model):
     name: str = ""
     """name in messages"""
     contact: Contact = "separate"
-    """what particles do at the surface: stick to it (sticky), slide along it (slip), slide and leave it (separate)"""
+    """motion of particles at the surface: stick to it (sticky), slide along it (slip), slide and leave it (separate)"""
     friction: NotNegative = 0.0
     """Coulomb friction coefficient"""
     velocity: Vector | None = None
@@ -391,9 +391,9 @@ class Obstacle(Model):
     end: Positive | None = None
     """time at which it disappears [s]"""
     temperature: float | None = None
-    """temperature that it imposes on what it touches [K]; by default it insulates"""
+    """temperature that it imposes on material in contact [K]; insulating by default"""
     held: Literal["nodes", "surface"] = "nodes"
-    """where it imposes its temperature: at the nodes inside, or on its surface, which is more accurate"""
+    """location of its temperature: at the nodes inside, or on its surface, which is more accurate"""
     opacity: Annotated[float, Field(gt=0, le=1)] = 1.0
     """opacity in pictures; 1 is opaque"""
 
@@ -514,7 +514,7 @@ StoredField = Literal[
 
 
 class Output(Model):
-    """What is stored in addition to position and velocity, and in which other formats."""
+    """Stored fields in addition to position and velocity, and other formats."""
 
     fields: list[StoredField] = []
     """additional fields of the trajectory; stress is another name of cauchy_stress"""
@@ -537,10 +537,10 @@ class Render(Model):
     """Pictures (PNG) and video (MP4)."""
 
     color_by: Literal["speed", "stress", "pressure", "material", "temperature", "liquid", "layer"] = "speed"
-    """what the colours show; stress: the von Mises stress; layer: the height at the start, or for emitted particles
+    """quantity of the colours; stress: the von Mises stress; layer: the height at the start, or for emitted particles
     the time"""
     layers: Annotated[int, Field(ge=1)] = 8
-    """number of layers with colours of their own"""
+    """number of layers with different colours"""
     range: tuple[float, float] | None = None
     """ends of the colour scale; by default those of the whole run"""
     style: Literal["particles", "surface"] = "particles"
@@ -567,7 +567,7 @@ class Render(Model):
 
 
 class Content(Model):
-    """What fills a domain: the part of a scene that differs within a batch."""
+    """Content of a domain: the part of a scene that differs within a batch."""
 
     gravity: Vector | None = None
     """acceleration of gravity [m/s^2]"""
@@ -596,8 +596,8 @@ class SceneData(Content):
     title: str = ""
     """title of the pictures"""
     origin: Vector | None = None
-    """coordinates that positions are stored relative to [m]: for scenes far from zero, such as those in coordinates of
-    maps. All coordinates of this file and of the outputs stay as they are; potential energy is zero at the origin"""
+    """point to which stored positions are relative [m]: for scenes far from zero, such as those in map coordinates.
+    Coordinates of this file and of the outputs are unaffected; potential energy is zero at the origin"""
     grid: Grid
     """the domain"""
     duration: Positive
@@ -611,7 +611,7 @@ class SceneData(Content):
     transfer: Literal["apic", "pic", "flip"] = "apic"
     """how velocity is transferred between particles and grid"""
     flip: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """share of FLIP that the transfer is blended with"""
+    """share of FLIP blended into the transfer"""
     precision: Literal["float32", "float64"] = "float32"
     """floating-point type of the simulation"""
     device: Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:[0-9]{1,3})?)$")] = "auto"
