@@ -230,7 +230,7 @@ def test_what_fits_into_memory(memory):
 
 
 def test_too_little_memory_is_said():
-    with pytest.raises(ValueError, match="memory must be at least 900 bytes, of a step and of kept states, got 500"):
+    with pytest.raises(ValueError, match="memory must be at least 900 bytes, for a step and stored states, got 500"):
         checkpoints.fitting(500, 10, 100, 700)
     with pytest.raises(ValueError, match="memory must be at least"):
         step, state = make("network", "cpu")
@@ -289,7 +289,7 @@ def test_an_estimate_of_a_rollout_in_one_op(device):
     estimate = mpm.estimate_rollout(step, state, 20, DT, checkpoint=5)
     assert estimate.per_particle * len(state) == pytest.approx(estimate.memory)
     words = str(estimate)
-    assert "4 kept states, 40 steps with those taken again" in words
+    assert "4 stored states, 40 steps including recomputed ones" in words
     assert mpm.estimate_rollout(step, state, 20, DT, truncate=5).steps == 15 + 2 * 5
     assert mpm.estimate_rollout(step, state, 0, DT).steps == 0
 

@@ -88,7 +88,7 @@ def _check(name: str, place: _Place) -> Any:
         for number, gradient in enumerate(grad_inputs):
             if isinstance(gradient, Tensor) and gradient.dim() > 0 and bool(gradient.isnan().any()):
                 given = any(isinstance(g, Tensor) and bool(g.isnan().any()) for g in grad_outputs)
-                came = "; what came to it was NaN already" if given else ""
+                came = "; its incoming gradient was NaN already" if given else ""
                 raise RuntimeError(
                     f"the gradient of {name} is NaN (of its input {number}) in substep {place.substep} of the rollout, "
                     f"{place.scenes(gradient)}{came}"

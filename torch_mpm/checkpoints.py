@@ -113,7 +113,7 @@ def fitting(memory: float, n: int, state_bytes: int, step_bytes: int, offload: b
     states = int((memory - step_bytes) // max(on_device, 1))
     if on_device == 0 or states < 2:
         least = step_bytes + 2 * on_device
-        raise ValueError(f"memory must be at least {least} bytes, of a step and of kept states, got {memory:g}")
+        raise ValueError(f"memory must be at least {least} bytes, for a step and stored states, got {memory:g}")
     return Checkpoints(states=min(states, n))
 
 

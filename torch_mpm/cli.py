@@ -150,7 +150,7 @@ def _parser() -> argparse.ArgumentParser:
     check.set_defaults(command=_check)
 
     info = commands.add_parser(
-        "info", help="what a scene uses and how long it takes; without a scene, what this installation can do"
+        "info", help="fields, memory and run time of a scene; without a scene, properties of this installation"
     )
     _scene_arguments(info, optional=True)
     info.set_defaults(command=_info)

@@ -133,7 +133,7 @@ class GradientNorms:
         total = self.total().cpu()
         found = [_length(total[:, b], self._steps, growth) for b in range(self._scenes)]
         if not bool((total > 0).any()):
-            raise ValueError("GradientNorms must have seen a backward pass, which found a gradient, before it can tell")
+            raise ValueError("GradientNorms.truncation needs a backward pass with a gradient first")
         lengths = [length for length in found if length is not None]
         return min(lengths) if lengths else None
 

@@ -112,7 +112,7 @@ class _Call:
             raise RuntimeError(f"{CHANGED}: {len(self._places)} tensors the first time, then {found}")
 
 
-CHANGED = "what the backward pass calls again must keep the same tensors for it"
+CHANGED = "a recomputed function must save the same tensors for the backward pass"
 
 
 def _kind(t: Tensor) -> tuple[Any, ...]:

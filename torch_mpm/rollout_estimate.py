@@ -51,7 +51,7 @@ class RolloutEstimate:
         host = f" and {in_words(self.host_memory)} on the host" if self.host_memory else ""
         return (
             f"{in_words(self.memory)} ({in_words(self.per_particle)} a particle){host}, {self.seconds:.3g} s: "
-            f"{self.kept_states} kept states, {self.steps} steps with those taken again"
+            f"{self.kept_states} stored states, {self.steps} steps including recomputed ones"
         )
 
 

@@ -84,8 +84,8 @@ class Parts:
                         if acted is not state and k in cuts:
                             raise ValueError(
                                 f"hook must not return a state before step {k}, where truncate={self.truncate} cuts "
-                                f"the gradient, of what it returned too: choose truncate and every={self.every} such "
-                                "that n - truncate, n - 2 truncate, ... are no multiples of every"
+                                f"the gradient, also that of its result: choose truncate and every={self.every} such "
+                                "that n - truncate, n - 2 truncate, ... are not multiples of every"
                             )
                         if acted is not state:
                             began = state = acted

@@ -272,7 +272,7 @@ def _exactly(count: int, shape: Region, method: str, seed: int, progress: Progre
             break
         spacing *= CLOSER
     else:
-        raise ValueError(f"the shape takes less than {count} points however near they are; is its volume right?")
+        raise ValueError(f"the shape has space for fewer than {count} points at any distance; is its volume correct?")
     kept = torch.zeros(len(x), dtype=torch.bool)
     kept[torch.randperm(len(x), generator=torch.Generator().manual_seed(seed))[:count]] = True
     return x[kept]

@@ -163,7 +163,7 @@ class State:
                 finite, or wrong shapes.
         """
         if not isinstance(points, Points):
-            raise TypeError(f"points must be what torch_mpm.seed gives, got {shape_of(points)}")
+            raise TypeError(f"points must be a result of torch_mpm.seed, got {shape_of(points)}")
         P, D = points.x.shape
         density = _checked_density(density, P)
         check_dtype(dtype)
@@ -584,8 +584,8 @@ def _extra(key: str, state: State, number: int, states: Sequence[State]) -> Tens
     if key not in state.extra:
         has = next(k for k, s in enumerate(states) if key in s.extra)
         raise ValueError(
-            f"state {number} has no extra[{key!r}], which state {has} has: set it, or join what step.prepare makes of "
-            "the states"
+            f"state {number} has no extra[{key!r}], which state {has} has: set it, or join the results of "
+            "step.prepare for the states"
         )
     return state.extra[key]
 

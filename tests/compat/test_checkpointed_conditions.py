@@ -135,7 +135,7 @@ def test_conditions_stay_until_the_backward_pass(reentrant):
     x, v, C, F = start("cpu")
     loss = checkpoint(solver, x, v, C, F, torch.zeros_like(F), use_reentrant=reentrant)[0].sum()
     set_boundary_conditions(solver, [CONDITIONS["surface"]])
-    with pytest.raises(RuntimeError, match="conditions of the solver must stay as they are until the backward pass"):
+    with pytest.raises(RuntimeError, match="conditions of the solver must not change before the backward pass"):
         loss.backward()
 
 

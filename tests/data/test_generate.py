@@ -175,7 +175,7 @@ def test_an_extended_data_set_is_one_that_was_extended_at_once(copy, tmp_path):
 
 def test_another_device_is_refused(copy):
     datasets.forge(copy / "dataset.json", lambda words: words.update(device="cuda"))
-    with pytest.raises(OutputError, match="begun on cuda, and process 0 of 1 would go on with it on cpu"):
+    with pytest.raises(OutputError, match="begun on cuda, and process 0 of 1 would continue it on cpu"):
         generate(configuration(), copy, device="cpu")
 
 

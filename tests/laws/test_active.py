@@ -91,7 +91,7 @@ def test_a_controller_has_gradients(checkpoint, device):
 
 
 def test_wrong_muscles(device):
-    with pytest.raises(ValueError, match="law must move F, of which fibres have their direction, got WeaklyCompress"):
+    with pytest.raises(ValueError, match="law must update F, which gives fibres their direction, got WeaklyCompress"):
         mpm.Active(mpm.WeaklyCompressible(1e4), (1.0, 0.0))
     with pytest.raises(ValueError, match=r"direction must be a floating tensor of shape \[D\] or \[P, D\], got \[4\]"):
         mpm.Active(passive(), torch.ones(4))

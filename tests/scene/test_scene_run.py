@@ -190,7 +190,7 @@ def test_a_disk_that_fills_up_leaves_whole_frames(tmp_path, monkeypatch):
 
     monkeypatch.setattr(writer, "CHECKPOINT_SECONDS", 0.0)
     monkeypatch.setattr(module.checkpoint, "save", full)
-    with pytest.raises(OutputError, match=r"no room on the disk .*No space left.* frames written so far are whole"):
+    with pytest.raises(OutputError, match=r"no room on the disk .*No space left.* frames written so far are complete"):
         scene.run(tmp_path / "out")
     monkeypatch.undo()
     with Trajectory(tmp_path / "out") as read:

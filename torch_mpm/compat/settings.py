@@ -22,5 +22,7 @@ def setting(configuration: Any, name: str, default: Any = _NEEDED) -> Any:
         value = getattr(configuration, name, default)
     if value is _NEEDED:
         raise ValueError(f"the configuration must have {name}")
-    refuse_grad("values of a configuration are copied; assign what it makes, such as law.log_E", **{name: value})
+    refuse_grad(
+        "values of a configuration are copied; assign an attribute of its result, such as law.log_E", **{name: value}
+    )
     return value

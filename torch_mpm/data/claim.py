@@ -30,7 +30,7 @@ TABLE = 2**40
 
 def output_errors(folder: Path) -> contextlib.AbstractContextManager[None]:
     """Errors that prevent this process from writing in a folder, as an OutputError."""
-    kept = "The shards written so far are whole; free some space and generate again to go on"
+    kept = "The shards written so far are complete; free some space and generate again to continue"
     return folder_errors(folder, kept)
 
 
@@ -117,7 +117,7 @@ class Claim:
         if found.device != self.record.device:
             raise OutputError(
                 f"{self.folder} holds a data set that was begun on {found.device}, and process {self.worker.rank} of "
-                f"{self.worker.size} would go on with it on {self.record.device}, where results differ by rounding; "
+                f"{self.worker.size} would continue it on {self.record.device}, where results differ by rounding; "
                 f'use device "{found.device}", or choose another folder'
             )
 

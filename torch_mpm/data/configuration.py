@@ -243,7 +243,7 @@ def _checked(words: Words) -> Dataset:
         problems.append("dataset: missing; takes a table with splits, frames and interval")
     shared = {key: value for key, value in words.items() if key not in VARIED}
     for key in distribution.found(shared):
-        problems.append(f"{key}: takes no distribution; what may differ between scenes is {', '.join(VARIED)}")
+        problems.append(f"{key}: takes no distribution; only these may differ between scenes: {', '.join(VARIED)}")
     try:
         grid = schema.Grid(**words["grid"])
     except (ValidationError, KeyError, TypeError):

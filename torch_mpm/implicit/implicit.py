@@ -232,7 +232,7 @@ def check_implicit(step: Step, state: State) -> None:
     """
     if is_traced(state.x) or is_captured(state.x) or torch._C._are_functorch_transforms_active():
         raise NotImplementedError(
-            "an implicit step looks at how far its solve is: it cannot be compiled, captured in a CUDA graph, or "
+            "an implicit step waits for the results of its solve: it cannot be compiled, captured in a CUDA graph, or "
             "transformed by torch.func; its gradients are those of backward() and torch.autograd.grad"
         )
     if state.impulse is None:

@@ -49,7 +49,7 @@ class Active(Material):
         super().__init__()
         self.law = law = as_law("law", law)
         if "F" not in law.state_fields:
-            raise ValueError(f"law must move F, of which fibres have their direction, got {type(law).__name__}")
+            raise ValueError(f"law must update F, which gives fibres their direction, got {type(law).__name__}")
         self._everywhere = not isinstance(direction, Tensor)  # Numbers are valid on any device.
         if not isinstance(direction, Tensor):
             direction = torch.tensor(check_vector("direction", direction), dtype=torch.float64, device="cpu")

@@ -117,7 +117,7 @@ def _fake(x: Tensor, *arguments) -> Tensor:
 
 
 def _no_backward(ctx: Any, *grads: Tensor) -> None:
-    raise NotImplementedError("what a survey finds is not differentiable: take it under torch.no_grad()")
+    raise NotImplementedError("results of a survey are not differentiable: call it under torch.no_grad()")
 
 
 for _name in ("survey", "law_figures"):

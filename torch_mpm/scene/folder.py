@@ -117,7 +117,7 @@ def prepare(folder: Path, scene: Scene, layout: Layout, fingerprint: str) -> Non
         create(folder / PARTIAL, layout)
 
 
-KEPT = "The frames written so far are whole; free some space and add --resume to continue"
+KEPT = "The frames written so far are complete; free some space and add --resume to continue"
 
 
 @contextlib.contextmanager

@@ -568,5 +568,5 @@ def _save_last_good(folder: Path, state: State, failure: SceneFailure) -> str:
     try:
         checkpoint.save(path, {k: v.cpu() for k, v in checkpoint.tensors_of(state).items()}, record)
     except OSError as error:
-        return f"The state before it could not be kept: {error.strerror or error}."
+        return f"The last good state could not be stored: {error.strerror or error}."
     return f"The state before it is in {path}."

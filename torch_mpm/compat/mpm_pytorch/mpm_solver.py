@@ -153,7 +153,7 @@ class MPMSolver:
         """Time of the recomputed call; that of the solver where no condition depends on it."""
         known = self._times.of(arguments)
         if known and all(changes != self._changes for _, changes in known):
-            raise RuntimeError("conditions of the solver must stay as they are until the backward pass of a checkpoint")
+            raise RuntimeError("conditions of the solver must not change before the backward pass of a checkpoint")
         found = sorted({time for time, changes in known if changes == self._changes})
         times = found or [0.0, self.time]
         first, last = min(times), max(times)

@@ -55,7 +55,7 @@ def _codes(dataset: DatasetFolder) -> dict[int, int]:
     kinds = set().union(*(np.unique(scene["particle_type"]).tolist() for scene in stored)) - {RIGID, BOUNDARY}
     codes = [FLUID, *range(RIGID_BODY + 1, PARTICLE_TYPES)]
     if len(kinds) > len(codes):
-        raise DatasetError(f"LagrangeBench has {len(codes)} codes for what flows, got {len(kinds)} particle types")
+        raise DatasetError(f"LagrangeBench has {len(codes)} codes for fluids, got {len(kinds)} particle types")
     return dict(zip(sorted(kinds), codes, strict=False))
 
 
