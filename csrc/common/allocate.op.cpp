@@ -11,7 +11,7 @@ namespace mpm {
 namespace {
 
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
-// Of a type that the pool has memory for, else 0.
+// Bytes of an element of a type that the pool supports, otherwise 0.
 int64_t element_size(ScalarType type) {
   switch (type) {
     case ScalarType::Double:
@@ -33,14 +33,14 @@ int64_t element_size(ScalarType type) {
   }
 }
 
-// A tensor in memory of the pool; not defined where the tensor is small or the pool has none.
+// Tensor in memory of the pool; undefined where the tensor is small or the pool has no memory.
 Tensor empty_in_pool(const Tensor& like, const Shape& shape, const Shape& strides, ScalarType type) {
   int64_t last = 0;
   for (size_t i = 0; i < shape.size(); i++) {
     if (shape[i] == 0) return {};
     last += (shape[i] - 1) * strides[i];
   }
-  const int64_t bytes = (last + 1) * element_size(type);  // zero of other types
+  const int64_t bytes = (last + 1) * element_size(type);  // zero for other types
   cpu::Buffer* buffer = bytes < cpu::kPooled ? nullptr : cpu::take(bytes);
   if (!buffer) return {};
   return torch::stable::from_blob(buffer->data, shape, strides, like.device(), type,
@@ -52,7 +52,7 @@ Tensor empty_in_pool(const Tensor& like, const Shape& shape, const Shape& stride
   STD_TORCH_CHECK(false, "a result of shape ", text(shape), " could not be allocated");
 }
 
-// Refuses sizes whose products below would overflow, or that no memory holds.
+// Refuses sizes whose products below would overflow, or that exceed any memory.
 void check_allocatable(const Shape& shape) {
   constexpr int64_t most = int64_t(1) << 48;
   int64_t count = 1;
@@ -90,7 +90,7 @@ Tensor empty(const Tensor& like, const Shape& shape) { return empty(like, shape,
 
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
 void clear_memory(void* memory, int64_t bytes) {
-  constexpr int64_t grain = 1 << 18;  // bytes that one thread clears sooner than it calls others
+  constexpr int64_t grain = 1 << 18;  // bytes below which clearing on one thread is faster
   cpu::parallel_for(
       bytes, grain,
       [](void* data, int64_t begin, int64_t end) {

@@ -21,14 +21,14 @@ struct Stream {
 inline void clear(Tensor& t, Stream) { mpm::clear(t); }
 }  // namespace cpu
 namespace backend = cpu;
-// Keeps other threads away from what is short, by the rows of a tensor; gives the kernels' stream argument.
+// Excludes other threads from short work, by the rows of a tensor; returns the stream argument of the kernels.
 class DeviceScope {
  public:
   explicit DeviceScope(const Tensor& t) : alone_(t.dim() > 0 && t.size(0) < kFew) {}
   cpu::Stream stream() const { return {}; }
 
  private:
-  static constexpr int64_t kFew = 2048;  // which loops take some ten microseconds for
+  static constexpr int64_t kFew = 2048;  // number of rows that loops process in about ten microseconds
   cpu::Alone alone_;
 };
 }  // namespace mpm
@@ -43,7 +43,7 @@ namespace cuda {
 using Stream = cudaStream_t;
 }  // namespace cuda
 namespace backend = cuda;
-// Makes the tensor's device current and gives torch's current stream of that device.
+// Makes the tensor's device current and returns torch's current stream of that device.
 struct DeviceScope {
   explicit DeviceScope(const Tensor& t) : guard(t.get_device_index()) {
     void* current = nullptr;
@@ -67,8 +67,8 @@ inline void clear(Tensor& t, Stream stream) {
 
 // MPM_BACKEND_KERNELS(LIST) makes the kernels of a family callable as backend::name(arguments, stream), or
 // backend::name(order, arguments, stream). LIST(PLAIN, ORDERED, SIZE) names them with their arguments: kernels, kernels
-// with the order of the B-spline as a template parameter, and functions that give the bytes of a work space. On the CPU
-// a call goes to the best instruction set that was built and that the machine has.
+// with the order of the B-spline as a template parameter, and functions that return the bytes of a work space. On the
+// CPU a call selects the best compiled instruction set that the machine supports.
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
 #define MPM_DECLARE_PLAIN(name, Arguments) \
   template <class T, int D>                \

@@ -77,8 +77,8 @@ inline double inverse_inertia(int64_t order) {
   return order == 2 ? BSpline<2>::inverse_inertia : BSpline<3>::inverse_inertia;
 }
 
-// The weight of one node, for a thread that adds to node k of every particle: c + d² (p + q d), d being the distance
-// from a point of the spline.
+// Weight of one node, for a thread that adds to node k of every particle: c + d² (p + q d), d being the distance from a
+// point of the spline.
 template <int Order, class T>
 struct NodeWeight;
 

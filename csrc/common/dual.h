@@ -97,7 +97,7 @@ MPM_HD T value_of(const Dual<T>& a) {
   return a.value;
 }
 
-// The scalar under a dual number, or the scalar itself; `lift` makes a constant of it.
+// Scalar under a dual number, or the scalar itself; `lift` makes a constant of it.
 template <class T>
 struct Underlying {
   using type = T;

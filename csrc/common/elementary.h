@@ -28,11 +28,11 @@ MPM_HD double select(bool condition, double a, double b) { return condition ? a 
 MPM_HD float value_of(float x) { return x; }
 MPM_HD double value_of(double x) { return x; }
 
-// ln a of a = 1 + a_minus_1, given both because each is inaccurate where the other is accurate.
+// ln a of a = 1 + a_minus_1; both are given because each is inaccurate where the other is accurate.
 MPM_HD float log_1p(float a, float a_minus_1) { return ::fabsf(a_minus_1) < 0.5f ? ::log1pf(a_minus_1) : ::logf(a); }
 MPM_HD double log_1p(double a, double a_minus_1) { return ::fabs(a_minus_1) < 0.5 ? ::log1p(a_minus_1) : ::log(a); }
 
-// 1/x and a/x of normal numbers, on a GPU without the branch by which a division takes care of the others.
+// 1/x and a/x of normal numbers, on a GPU without the branch of a division for other numbers.
 template <class T>
 MPM_HD T reciprocal(const T& x) {
   return T(1) / x;
@@ -60,7 +60,7 @@ MPM_HD T quotient(const T& a, const T& x) {
 }
 #endif
 
-// The bits of IEEE numbers, for functions that take the exponent apart.
+// Bits of IEEE numbers, for functions that process the exponent separately.
 template <class T>
 struct Format;
 template <>
@@ -100,7 +100,7 @@ MPM_HD Value logarithm(const Value& a, const Value& a_minus_1) {
   const Value k = __builtin_bit_cast(Value, shifted) - F::shifter;
   const Value f = k == 0 ? a_minus_1 : m - 1;
   const Value s = quotient<Value>(f, 2 + f), z = s * s, half_square = T(0.5) * f * f;
-  constexpr auto terms = F::log_terms;  // which the device would not find in memory
+  constexpr auto terms = F::log_terms;  // not found in memory by the device
   Value series = terms.back() - Value{};
   MPM_UNROLL for (int i = int(terms.size()) - 2; i >= 0; i--)
     series = terms[i] + z * series;

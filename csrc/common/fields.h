@@ -4,8 +4,8 @@
 
 #include "common/host_device.h"
 
-// Particle and node values as the kernels see them: plain pointers and strides, shared by the CPU and CUDA kernels.
-// Only the files *.op.cpp know tensors.
+// Particle and node values in the form of kernels: plain pointers and strides, shared by the CPU and CUDA kernels. Only
+// the files *.op.cpp use tensors.
 namespace mpm {
 
 // A tensor [P], [P, I] or [P, I, J] of any strides (in elements); a null pointer is an absent field.

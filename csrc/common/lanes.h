@@ -7,7 +7,7 @@
 // the lanes of a pack.
 namespace mpm {
 
-// Some of the particles: those of one material, or all.
+// Subset of the particles: those of one material, or all.
 struct Members {
   const int* material = nullptr;  // [P], or null for all
   int64_t stride = 0;
@@ -24,10 +24,10 @@ struct One {
   int64_t p;
 
   MPM_HD T load(const T* pointer, int64_t stride) const { return pointer[p * stride]; }
-  // Of a value that is often the same for all particles, which have the stride 0 then.
+  // A value that is often the same for all particles; its stride is then 0.
   MPM_HD T load_shared(const T* pointer, int64_t stride) const { return load(pointer, stride); }
   MPM_HD void store(T* pointer, int64_t stride, const T& value) const { pointer[p * stride] = value; }
-  // f(particle) of each particle.
+  // f(particle) for each particle.
   template <class F>
   MPM_HD T each(const F& f) const {
     return f(p);
@@ -35,7 +35,7 @@ struct One {
   MPM_HD void store_integer(int* pointer, const T& value) const { pointer[p] = int(value); }
 };
 
-// What is stored is added to what is there.
+// Stored values are added to the present ones.
 template <class At>
 struct Adding : At {
   MPM_HD explicit Adding(const At& at) : At(at) {}

@@ -7,8 +7,8 @@
 
 #include "common/elementary.h"
 
-// Pack<T, N>: N values of T that are computed with at once, on GCC and Clang vector extensions. A formula written for a
-// scalar T serves N particles when called with a pack. For the CPU only.
+// Pack<T, N>: N values of T in one computation, on GCC and Clang vector extensions. A formula written for a scalar T
+// computes N particles when called with a pack. For the CPU only.
 namespace mpm {
 inline namespace TORCH_MPM_ISA {
 
@@ -20,7 +20,7 @@ constexpr int kRegisterBytes = 32;
 constexpr int kRegisterBytes = 16;
 #endif
 
-// A register of values, and the integers of the same width that comparisons give.
+// Register of values, and the integers of the same width that comparisons return.
 template <class T, int Width>
 struct RegisterOf;
 template <int Width>
@@ -68,7 +68,7 @@ struct Pack {
 
   MPM_HD static Pack load(const T* from) {
     Pack r;
-    MPM_UNROLL for (int k = 0; k < kParts; k++)  // in one, several registers would go over the stack
+    MPM_UNROLL for (int k = 0; k < kParts; k++)  // copied together, several registers would pass through the stack
       __builtin_memcpy(&r.part[k], from + k * kWidth, sizeof(r.part[k]));
     return r;
   }
@@ -205,7 +205,7 @@ MPM_HD Pack<T, N> map(const Pack<T, N>& a, const F& f) {
 }
 
 #ifdef __FMA__
-// The instruction by name: whether the compiler contracts a * b + c depends on what stands around it.
+// The instruction by name: whether the compiler contracts a * b + c depends on the context.
 MPM_HD __m128 fused(__m128 a, __m128 b, __m128 c) { return _mm_fmadd_ps(a, b, c); }
 MPM_HD __m128d fused(__m128d a, __m128d b, __m128d c) { return _mm_fmadd_pd(a, b, c); }
 MPM_HD __m256 fused(__m256 a, __m256 b, __m256 c) { return _mm256_fmadd_ps(a, b, c); }
@@ -251,7 +251,7 @@ MPM_HD Pack<T, N> abs(const Pack<T, N>& a) {
 }
 
 #ifdef __AVX2__
-// The instructions by name, which choose b where the order is not known, too.
+// The instructions by name, which choose b where the order is undefined, too.
 #define MPM_LARGER(Register, prefix, suffix) \
   MPM_HD Register larger(Register a, Register b) { return prefix##_max_##suffix(a, b); }
 MPM_LARGER(__m128, _mm, ps)

@@ -116,7 +116,7 @@ py::dict evaluate(const std::string& law, const Array<double>& F_, const std::ve
   return result;
 }
 
-// The map of up to 8 strains in one pack; apart from what may throw, with which GCC 12 cannot align the stack.
+// Map of up to 8 strains in one pack; separate from code that may throw, with which GCC 12 cannot align the stack.
 template <class Energy, class T>
 __attribute__((noinline)) MappedStrain<Pack<T, 8>, 3> map_pack(const T* h, const T* alpha, const T* ratio, int count) {
   using P = Pack<T, 8>;
@@ -131,7 +131,7 @@ __attribute__((noinline)) MappedStrain<Pack<T, 8>, 3> map_pack(const T* h, const
   return return_map<Energy, P>(strain, cone, P(0) == P(0), P(0) < P(0), false);
 }
 
-// What is left of one lane: the strain, the branch plus 4 where the root was not found, and the evaluations of the
+// Result of one lane: the strain, the branch plus 4 where the root was not found, and the number of evaluations of the
 // yield function.
 template <class T>
 __attribute__((noinline)) void read_lane(const MappedStrain<Pack<T, 8>, 3>& m, int lane, T* h, int* branch,

@@ -33,7 +33,7 @@ bool on_main_thread() {
 
 void check_signals() {
   static thread_local Clock::time_point next;
-  static thread_local bool in_handler = false;  // which may call ops
+  static thread_local bool in_handler = false;  // may call ops
   const Clock::time_point now = Clock::now();
   if (now < next || in_handler) return;
   next = now + kBetweenChecks;
@@ -49,12 +49,12 @@ void check_signals() {
 
 namespace {
 
-// Of a device and a thread: marks between pieces of work.
+// Per device and thread: marks between pieces of work.
 class WorkInFlight {
  public:
   static WorkInFlight& of_this_thread() {
     constexpr int most_devices = 64;
-    static thread_local WorkInFlight* of_device[most_devices] = {};  // have no end: CUDA may be gone by then
+    static thread_local WorkInFlight* of_device[most_devices] = {};  // never destroyed: CUDA may be unloaded by then
     int device = 0;
     check(cudaGetDevice(&device));
     WorkInFlight*& own = of_device[std::clamp(device, 0, most_devices - 1)];
@@ -77,8 +77,8 @@ class WorkInFlight {
   }
 
  private:
-  // In flight are kMarks + 1 pieces at most: a tenth to a third of a second of a device that takes 10^9 particles
-  // through a substep in a second, and enough that it never waits for the host.
+  // At most kMarks + 1 pieces are in flight: a tenth to a third of a second of a device that computes 10^9 particle
+  // substeps per second, and enough that it never waits for the host.
   static constexpr int64_t kPiece = int64_t(1) << 25;
   static constexpr int kMarks = 4;
 
@@ -89,7 +89,7 @@ class WorkInFlight {
   cudaEvent_t marks_[kMarks] = {};
 };
 
-constexpr int64_t kLeastParticles = 1 << 13;  // fewer take no less time
+constexpr int64_t kLeastParticles = 1 << 13;  // fewer do not take less time
 
 }  // namespace
 

@@ -96,7 +96,7 @@ MPM_HD void orthogonalize(Matrix<T, D>& B, Matrix<T, D>& V, int p, int q) {
   const T square = T(0.5) + T(0.5) * cosine * inverse_norm, inverse = rsqrt_estimate(square);
   const T large = square * inverse, small = T(0.5) * sine * inverse_norm * inverse;
   const auto exchange = difference < T(0);
-  // What is left of 1 − c² − s² would add up over the rotations.
+  // The remainder of 1 − c² − s² would accumulate over the rotations.
   const T excess = T(0.5) * (T(1) - large * large - small * small);
   const T cosine_half = large + excess * large, sine_half = small + excess * small;
   const T c = select(exchange, sine_half, cosine_half), s = select(exchange, cosine_half, sine_half);
@@ -116,7 +116,7 @@ MPM_HD decltype(T(0) > T(0)) is_oblique(const Matrix<T, D>& B, double cosine) {
   return excess > T(0);
 }
 
-// Sweeps over the columns of B, of which V takes part, until their cosines are small.
+// Sweeps over the columns of B, and the same rotations of V, until their cosines are small.
 template <class T, int D>
 MPM_HD void sweep_columns(Matrix<T, D>& B, Matrix<T, D>& V, int least, int most, double cosine) {
 #ifdef __CUDACC__

@@ -15,8 +15,8 @@
 
 #include "common/fields.h"
 
-// Checks, allocation and views shared by the op families. The Python face has checked values and given readable errors
-// already; here everything is checked again that memory safety depends on.
+// Checks, allocation and views shared by the op families. The Python wrapper has checked values and given readable
+// errors already; here everything that memory safety depends on is checked again.
 namespace mpm {
 
 using torch::headeronly::ScalarType;
@@ -42,7 +42,7 @@ inline Shape sizes_of(const Tensor& t) {
 
 inline std::string shape_of(const Tensor& t) { return text(sizes_of(t)); }
 
-// As Python calls it.
+// Name in Python.
 inline const char* name_of(ScalarType type) {
   switch (type) {
     case ScalarType::Float:
@@ -62,7 +62,7 @@ inline const char* name_of(ScalarType type) {
 
 // ---- Checks
 
-// Sizes of dimensions that a tensor lacks are not checked by every torch version: ask for the rank first.
+// Not every torch version checks sizes of dimensions that a tensor lacks: query the rank first.
 inline void check_rank(const Tensor& t, const char* name, int64_t rank) {
   STD_TORCH_CHECK(t.dim() == rank, name, " must have ", rank, " dimensions, got shape ", shape_of(t));
 }
@@ -143,8 +143,8 @@ Tensor zeros(const Tensor& like, const Shape& shape);
 void clear(Tensor& t);
 void clear_memory(void* memory, int64_t bytes);  // of the CPU
 
-// Elements from row to row of a structure of arrays. On the CPU, rows of whole pages (P a power of two) would share
-// cache sets, and a load would wait for stores to other rows whose addresses end alike: 23 cache lines more than pages
+// Elements between rows of a structure of arrays. On the CPU, rows of whole pages (P a power of two) would share cache
+// sets, and a load would wait for stores to other rows with equal low address bits: 23 cache lines more than pages
 // spread the nine rows of a matrix evenly over a page of 64.
 inline int64_t particle_pitch(const Tensor& like, int64_t particles) {
   if (!like.is_cpu()) return particles;
@@ -156,7 +156,7 @@ inline int64_t particle_pitch(const Tensor& like, int64_t particles) {
 // A [P, ...] tensor stored as structure of arrays: the particle index is contiguous.
 Tensor empty_particles(const Tensor& like, const Shape& shape);
 
-// A result per particle; where it is not wanted it stays undefined, None in Python.
+// Result per particle; undefined, None in Python, where it is not requested.
 inline Tensor result(const Tensor& like, bool wanted, const Shape& shape) {
   return wanted ? empty_particles(like, shape) : Tensor();
 }

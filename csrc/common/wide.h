@@ -3,7 +3,7 @@
 #include "common/matrix.h"
 #include "common/roots.h"
 
-// Float64 for the small differences of float32 arguments, and conversions between the two; float64 stays what it is.
+// Float64 for the small differences of float32 arguments, and conversions between the two; float64 is unchanged.
 namespace mpm {
 inline namespace TORCH_MPM_ISA {
 

@@ -3,11 +3,11 @@
 #include "cpu/parallel.h"
 #include "cpu/schedule.h"
 
-// Base blocks, those that hold the base nodes of particles, and the loop over them.
+// Base blocks, which hold the base nodes of particles, and the loop over them.
 namespace mpm::cpu {
 inline namespace TORCH_MPM_ISA {
 
-// A slot that holds particles, and the slots of the blocks that these can touch: o as in activate.cpu.cpp.
+// A slot with particles, and the slots of the blocks in their support: o as in activate.cpu.cpp.
 template <class T, int D>
 struct BaseBlock {
   int scene;
@@ -36,10 +36,10 @@ MPM_HD int cell_coordinate(int cell, int axis) {
   return cell >> 2 * (D - 1 - axis) & (kBlockWidth - 1);
 }
 
-// Calls f(next) once per thread, where next() hands out the base blocks of a schedule colour by colour.
+// Calls f(next) once per thread, where next() returns the base blocks of a schedule colour by colour.
 template <int D, class F>
 void parallel_base_blocks(const ScheduleIn& s, int64_t particles, const F& f) {
-  constexpr int64_t kBlocks = 4, kParticles = 2048;  // that are worth a thread
+  constexpr int64_t kBlocks = 4, kParticles = 2048;  // number of particles that justifies a thread
   const int64_t base_blocks = s.colour_start[kColours<D>];
   const int64_t by_blocks = (base_blocks + kBlocks - 1) / kBlocks,
                 by_particles = (particles + kParticles - 1) / kParticles;

@@ -5,11 +5,11 @@
 namespace mpm::cpu {
 inline namespace TORCH_MPM_ISA {
 
-// A stable counting sort of at most kChunk particles: nth[i] is the particle that is i-th by cell, end[c] how many
-// there are up to and including cell c. Returns whether they were not in order.
+// Stable counting sort of at most kChunk particles: nth[i] is the particle that is i-th by cell, end[c] the number of
+// particles up to and including cell c. Returns whether they were unsorted.
 template <int Cells>
 bool sort_by_cell(const uint8_t* cell, int count, uint16_t* nth, uint16_t* end) {
-  // Four counts of each cell, so that particles that follow each other do not wait for the same one.
+  // Four counts of each cell, so that consecutive particles do not wait for the same one.
   uint16_t counts[4][Cells] = {}, next[Cells];
   bool falls = false;
   for (int i = 1; i < count; i++) falls |= cell[i - 1] > cell[i];

@@ -8,7 +8,7 @@
 namespace mpm::cpu {
 inline namespace TORCH_MPM_ISA {
 
-constexpr int kLanes = 8;  // of a pack of particles: cells hold about that many
+constexpr int kLanes = 8;  // for a pack of particles: cells hold about that many
 template <class T>
 using Lanes = Pack<T, kLanes>;
 // Lanes where nothing depends on the cells: a register of values, if that is more.
@@ -36,7 +36,7 @@ struct Chunk {
 };
 
 // Up to N particles; id repeats the first one beyond the count. Where they are `consecutive`, all lanes may be read and
-// written, whatever the count.
+// written, for any count.
 template <int N>
 struct GroupOf {
   static constexpr int kSize = N;
@@ -44,16 +44,16 @@ struct GroupOf {
   bool consecutive;
   int id[N];
 #ifdef __AVX512VL__
-  // Otherwise: runs of lanes whose particles lie one after another in memory. Particles that have changed places since
-  // they were sorted are few, so most groups have one to three.
+  // Otherwise: runs of lanes whose particles are contiguous in memory. Few particles have changed places since the last
+  // sort, so most groups have one to three runs.
   int runs;
   uint16_t lanes[N];  // of each run, as bits
-  int start[N];       // the particle that lane 0 would have in the run
+  int start[N];       // particle of lane 0 if the run extended to it
 #endif
 
   void find_runs() {
 #ifdef __AVX512VL__
-    unsigned first = 1;  // lanes that begin a run, as bits
+    unsigned first = 1;  // first lanes of runs, as bits
     MPM_UNROLL for (int l = 1; l < N; l++)
       first |= unsigned(id[l] != id[l - 1] + 1) << l;
     const unsigned all = (1u << count) - 1;
@@ -84,7 +84,7 @@ MPM_HD GroupOf<N> group_by_id(const Chunk& c, int i) {
   return g;
 }
 
-// The particles whose numbers are given.
+// Particles with the given numbers.
 template <int N>
 MPM_HD GroupOf<N> group_of(const int* id, int count) {
   GroupOf<N> g;
@@ -114,7 +114,7 @@ MPM_HD Group group_by_cell(const Chunk& c, int i, int end) {
   return g;
 }
 
-// Of a scene: dt, or a multiple of it.
+// Per scene: dt, or a multiple of it.
 template <class T>
 MPM_HD T time_step(const Field<const T>& scene_dt, double dt, int scene) {
   return scene_dt.pointer ? T(dt) * scene_dt.pointer[scene * scene_dt.stride[0]] : T(dt);
@@ -190,7 +190,7 @@ MPM_HD void store(const Lanes<T>& v, const Field<T>& f, const Group& g, int i = 
   store_row(v, row_of(f, i, j), f.stride[0], g);
 }
 
-// N particles one after another in memory, of fields with unit stride: loads and stores without a question.
+// N contiguous particles of fields with unit stride: loads and stores without a test.
 template <int N>
 struct RunOf {
   static constexpr int kSize = N;
@@ -210,7 +210,7 @@ MPM_HD Pack<T, N> load(const Field<const T>& f, const RunOf<N>& r, int i = 0, in
   return load_row(row_of(f, i, j), 1, r);
 }
 
-// The same, of which only the first `count` are there.
+// The same with only the first `count` present.
 template <int N>
 struct PartOf {
   static constexpr int kSize = N;
@@ -236,7 +236,7 @@ MPM_HD void store_row(const Pack<T, N>& v, T* row, int64_t, const PartOf<N>& r) 
 #endif
 }
 
-// Where the N components of a field begin. A store through a Field makes the compiler read its strides again.
+// First addresses of the N components of a field. A store through a Field makes the compiler read its strides again.
 template <class T, int N>
 struct FieldRows {
   T* row[N] = {};  // null where the field is absent
@@ -249,7 +249,7 @@ struct FieldRows {
   MPM_HD explicit operator bool() const { return row[0]; }
 };
 
-// Whether all fields that are present have particles one after another.
+// Whether the particles of all present fields are contiguous.
 template <class... Fields>
 MPM_HD bool unit_stride(const Fields&... f) {
   return ((!f.pointer || f.stride[0] == 1) && ...);

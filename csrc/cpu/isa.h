@@ -6,15 +6,14 @@ namespace mpm::cpu {
 
 enum class Level { none, baseline, avx2, avx512 };
 
-// The best level that was built and that this machine has, or a lower one asked for by the environment variable
-// TORCH_MPM_ISA_LEVEL.
+// Best compiled level that this machine supports, or a lower one set by the environment variable TORCH_MPM_ISA_LEVEL.
 Level isa_level();
 
 [[noreturn]] void refuse_machine();
 
 }  // namespace mpm::cpu
 
-// The declarations in the namespace of every level that is built (setup.py), and a call of the best of them.
+// Declarations in the namespace of every compiled level (setup.py), and a call of the best of them.
 #ifdef TORCH_MPM_HAS_BASELINE
 #define MPM_CPU_DECLARE_BASELINE(...) \
   inline namespace baseline {         \

@@ -19,7 +19,7 @@ MPM_HD void store_lanes(T* pointer, int64_t stride, unsigned lanes, const Pack<T
     if (lanes >> i & 1) pointer[i * stride] = value[i];
 }
 
-// The same as calls: long kernels have a hundred of them, and would take twice as long to compile.
+// The same as calls: long kernels have a hundred of them, and would take twice as long to compile inline.
 template <class T, int N>
 [[gnu::noinline]] Pack<T, N> call_load_lanes(const T* pointer, int64_t stride, int count) {
   return load_lanes<T, N>(pointer, stride, count);
@@ -29,8 +29,8 @@ template <class T, int N>
   store_lanes(pointer, stride, lanes, value);
 }
 
-// Particles p, ..., p + count − 1 in the first lanes of a pack; the other lanes repeat the last one. Those of the bits
-// `lanes` are stored. What is not contiguous is read and written by code in place, or by calls.
+// Particles p, ..., p + count − 1 in the first lanes of a pack; the other lanes repeat the last one. Particles of the
+// bits `lanes` are stored. Non-contiguous data is read and written inline, or by calls.
 template <class T, int N, bool InPlace>
 struct Consecutive {
   using Value = Pack<T, N>;
@@ -71,7 +71,7 @@ struct Consecutive {
 namespace cpu {
 inline namespace TORCH_MPM_ISA {
 
-// f(at) with the particles, or some of them, in groups of one register or of another number of bytes.
+// f(at) for the particles, or some of them, in groups of one register or of another number of bytes.
 template <class T, int Bytes = kRegisterBytes, bool InPlace = true, class F>
 void for_groups(int64_t particles, const F& f, const Members& members = {}) {
   constexpr int N = Bytes / sizeof(T);

@@ -13,11 +13,11 @@ namespace mpm::cpu {
 namespace {
 
 #ifdef __linux__
-// Of the file: a mapping of each piece costs some microseconds, and a process may have 65530 of them.
+// Size of the file: a mapping of each piece costs some microseconds, and a process may have 65530 of them.
 constexpr int64_t kPiece = 16 << 20;
 
-// The file, which nobody writes any more. A process may close the descriptors that it does not know, and another file
-// gets the number then.
+// The file, which is not written any more. A process may close unknown descriptors, and another file then gets the
+// number.
 class OnesFile {
  public:
   OnesFile() : descriptor_(memfd_create("torch_mpm", MFD_CLOEXEC)) {
@@ -33,7 +33,7 @@ class OnesFile {
     if (!made_) close(descriptor_);
   }
 
-  // -1 where there is none, or no longer.
+  // -1 where there is none, or no longer one.
   int descriptor() const {
     struct stat now;
     if (!made_ || fstat(descriptor_, &now) != 0) return -1;

@@ -24,11 +24,11 @@ void pause() {
 #endif
 }
 
-constexpr int kSpins = 2000;  // some ten microseconds, which waking a thread would take too
+constexpr int kSpins = 2000;  // about ten microseconds, the time to wake a thread
 
-// Where the members of a team are. Beside other processes the system may leave two of them on one core for long, and
-// the other process alone on another: a member that finds another one on its core goes to a free one, as free to be
-// moved as before.
+// Placement of the members of a team. Beside other processes the system may leave two of them on one core for long, and
+// the other process alone on another: a member that finds another one on its core moves to a free one, and may be moved
+// again as before.
 class Cores {
  public:
   explicit Cores(int members) : members_(members < kMost ? members : kMost) {
@@ -47,7 +47,7 @@ class Cores {
   }
 
  private:
-  static constexpr int kMost = 64;  // members beyond stay where they are
+  static constexpr int kMost = 64;  // further members are not moved
 
 #ifdef __linux__
   void leave(int member) {
@@ -66,17 +66,17 @@ class Cores {
   std::atomic<int> core_[kMost];
 };
 
-// Threads that serve the loops of a leader. Nobody waits for a thread that has not begun: where another process has
-// its core, the others do its share. Who has begun is waited for asleep, which leaves a core to it.
+// Threads that run the loops of a leader. No thread waits for one that has not begun: where another process has its
+// core, the others do its share. Threads wait asleep for those that have begun, which frees a core.
 class Team {
  public:
   explicit Team(int members) : members_(members), cores_(members), shares_(chunks_, members) {}
 
   int members() const { return members_; }
 
-  // Of the leader, member 0.
+  // Share of the leader, member 0.
   void run(int64_t count, int64_t grain, Body body, void* context) {
-    // More chunks than members, so that one that comes late leaves little.
+    // More chunks than members, so that a late member leaves little.
     const int64_t least = grain > 0 ? grain : 1, most = (count + least - 1) / least, wanted = 4 * int64_t(members_);
     body_ = body, context_ = context, count_ = count;
     chunks_[1] = int(most < wanted ? most : wanted);
@@ -121,7 +121,7 @@ class Team {
   }
 
  private:
-  static constexpr int kOpen = 1 << 20;  // in the state, whose lower bits count those at work beside the leader
+  static constexpr int kOpen = 1 << 20;  // in the state, whose lower bits count the members at work beside the leader
 
   void work(int member) {
     Shares<1>::Place place;
@@ -157,7 +157,7 @@ int thread_count() { return int(torch::stable::get_num_threads()); }
 void parallel_for(int64_t count, int64_t grain, Body body, void* context) {
   if (Team* team = led) {
     if (count <= grain || team->members() == 1) return body(context, 0, count);
-    led = nullptr;  // loops inside of this one are not parallel
+    led = nullptr;  // loops inside this one are not parallel
     struct Restore {
       Team* team;
       ~Restore() { led = team; }
@@ -177,7 +177,7 @@ void with_team(void (*body)(void* context), void* context) {
     Team* const before = std::exchange(led, &team);
     try {
       body(context);
-    } catch (...) {  // which C functions on the way must not see
+    } catch (...) {  // not visible to the C functions in between
       error = std::current_exception();
     }
     led = before;

@@ -5,8 +5,8 @@
 #include "common/host_device.h"
 #include "common/instantiate.h"
 
-// Parallel loops for the kernels of csrc/cpu, which are compiled for several instruction sets and therefore see neither
-// torch nor templates of the standard library.
+// Parallel loops for the kernels of csrc/cpu, which are compiled for several instruction sets and therefore include
+// neither torch nor templates of the standard library.
 namespace mpm::cpu {
 
 int thread_count();
@@ -15,11 +15,11 @@ int thread_count();
 // split.
 void parallel_for(int64_t count, int64_t grain, void (*body)(void* context, int64_t begin, int64_t end), void* context);
 
-// Runs `body(context)` with the threads of torch at hand for all of its loops: one team for a call of many loops, whose
-// threads do not wait for each other longer than they must where other processes want the cores too.
+// Runs `body(context)` with the threads of torch available for all of its loops: one team for a call of many loops,
+// whose threads wait for each other as little as possible where other processes use the cores too.
 void with_team(void (*body)(void* context), void* context);
 
-// While it lives, this thread is alone in all of its loops, if wanted: what is short waits for nobody.
+// During its lifetime, this thread runs all of its loops alone, if requested: short loops then wait for no thread.
 class Alone {
  public:
   explicit Alone(bool wanted);
@@ -31,8 +31,8 @@ class Alone {
   const bool begins_;
 };
 
-// For who asks again and again, and has done so `spins` times: a pause, and asleep after some ten microseconds, so that
-// a wait that lasts leaves its core to whoever is waited for.
+// Pause of a waiting loop after `spins` checks; asleep after about ten microseconds, so that a long wait frees its
+// core.
 void rest(int spins);
 
 inline namespace TORCH_MPM_ISA {
@@ -44,17 +44,17 @@ void parallel_ranges(int64_t count, int64_t grain, const F& f) {
       const_cast<void*>(static_cast<const void*>(&f)));
 }
 
-// Hands out the items of consecutive phases to a team of threads: each member has a share of every phase, a range of
-// neighbours, and takes from those of others what they have not begun. So a thread stays with the same part of space,
-// whose nodes and particles its caches hold, from phase to phase and from kernel to kernel.
+// Distributes the items of consecutive phases over a team of threads: each member has a share of every phase, a range
+// of neighbours, and takes items of others that have not begun. So a thread processes the same part of space, whose
+// nodes and particles are in its caches, from phase to phase and from kernel to kernel.
 template <int Phases>
 class Shares {
  public:
   // start: [Phases + 1] first item of each phase.
   Shares(const int* start, int members) : start_(start), members_(members < kMost ? members : kMost) {}
 
-  // The next item for a member that calls with `place` zero at first; −1 at the end. A member leaves a phase when all
-  // of its items are taken.
+  // Next item for a member that calls with `place` zero at first; −1 at the end. A member leaves a phase when all of
+  // its items are taken.
   struct Place {
     int phase = 0, share = 0;
   };
@@ -71,7 +71,7 @@ class Shares {
   }
 
  private:
-  static constexpr int kMost = 64;  // threads beyond share a share
+  static constexpr int kMost = 64;  // further threads share a share
   int part(int64_t count, int member) const { return int(count * member / members_); }
 
   const int* start_;
@@ -81,7 +81,7 @@ class Shares {
   } taken_[kMost];
 };
 
-// Calls f(next) once per thread, where next() hands out the items of all phases, on at most `most` threads.
+// Calls f(next) once per thread, where next() returns the items of all phases, on at most `most` threads.
 template <int Phases, class F>
 void parallel_phases(const int* start, int64_t most, const F& f) {
   const int64_t threads = thread_count(), members = most < threads ? most : threads;
@@ -92,8 +92,8 @@ void parallel_phases(const int* start, int64_t most, const F& f) {
   });
 }
 
-// Counts the finished items of consecutive phases. A thread that took an item of a phase may wait for the phase before,
-// of which every item is taken then and has a thread at work on it.
+// Counts the finished items of consecutive phases. A thread with an item of a phase may wait for the previous phase:
+// each of its items is then taken by a running thread.
 template <int Phases>
 struct PhaseCounter {
   const int* start;  // [Phases + 1] first item of each phase

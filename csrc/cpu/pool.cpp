@@ -10,8 +10,8 @@ namespace {
 
 constexpr int64_t kPage = 4096, kLargePage = 1 << 21;
 
-// Buffers do not all start at the same place of a page: cache sets, and the comparison of loads with earlier stores,
-// know addresses by their low bits only.
+// Buffers start at different offsets in a page: cache sets, and the comparison of loads with earlier stores, use only
+// the low bits of addresses.
 constexpr int64_t kStagger = 9 * 64;
 
 int64_t rounded_up(int64_t n, int64_t to) { return (n + to - 1) / to * to; }
@@ -38,10 +38,10 @@ void unmap(Buffer* b) {
 
 struct Pool {
   std::mutex mutex;
-  std::vector<Buffer*> kept;  // the one given back last comes last: it may still be in a cache
+  std::vector<Buffer*> kept;  // the most recently released buffer is last: it may still be in a cache
   int64_t kept_bytes = 0, living_bytes = 0, count = 0;
 
-  // The smallest kept buffer that is large enough and not much larger.
+  // Smallest stored buffer that is large enough and not much larger.
   Buffer* find(int64_t bytes) {
     size_t best = kept.size();
     for (size_t i = kept.size(); i-- > 0;) {
@@ -56,7 +56,7 @@ struct Pool {
   }
 };
 
-// Never destroyed: tensors may die after it at the end of the process.
+// Never destroyed: tensors may outlive it at the end of the process.
 Pool& pool() {
   static Pool* p = new Pool;
   return *p;

@@ -2,9 +2,9 @@
 
 #include "grid/topology.h"
 
-// The order of work of the CPU kernels, which `activate` writes into the schedule tensor: base blocks (slots that hold
-// particles) grouped by colour, so that the nodes touched from two base blocks of one colour never overlap, and chunks
-// of at most kChunk particles of one base block, with the order of each chunk's particles by cell.
+// Work order of the CPU kernels, written by `activate` into the schedule tensor: base blocks (slots with particles)
+// grouped by colour, so that the nodes in the supports of two base blocks of one colour are disjoint, and chunks of at
+// most kChunk particles of one base block, with the order of each chunk's particles by cell.
 namespace mpm::cpu {
 
 constexpr int kChunk = 1024;

@@ -6,14 +6,14 @@
 #include "common/pack.h"
 #include "cpu/base_block.h"
 
-// Private copies of the nodes that the particles of one base block touch.
+// Private copies of the nodes in the support of one base block.
 namespace mpm::cpu {
 inline namespace TORCH_MPM_ISA {
 
 constexpr int kChannels = 4;  // channels that are transferred together
 
-// Nodes that the particles of one base block touch, kChannels values each. Rows run along the last axis and are long
-// enough to add four nodes anywhere.
+// Nodes in the support of one base block, kChannels values each. Rows run along the last axis and are long enough to
+// add four nodes anywhere.
 template <int Order, class T, int D>
 struct Tile {
   static constexpr int kWidth = kBlockWidth + Order, kRow = 2 * kBlockWidth * kChannels;

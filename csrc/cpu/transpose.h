@@ -16,7 +16,7 @@ MPM_HD V exchange(const V& a, const V& b, std::integer_sequence<int, Lane...>) {
   return __builtin_shufflevector(a, b, source(Lane)...);
 }
 
-// One round of a transposition: lanes and packs whose numbers differ in the bit `Step` change places.
+// One round of a transposition: lanes and packs whose numbers differ in the bit `Step` are exchanged.
 template <int Step, class T, int N>
 MPM_HD void exchange_all(Pack<T, N> r[8]) {
   constexpr auto all = std::make_integer_sequence<int, N>();
@@ -28,7 +28,7 @@ MPM_HD void exchange_all(Pack<T, N> r[8]) {
   }
 }
 
-// Transposes 8 packs of 8 lanes, or the two halves of 8 packs of 16 lanes by themselves.
+// Transposes 8 packs of 8 lanes, or the two halves of 8 packs of 16 lanes separately.
 template <class T, int N>
 MPM_HD void transpose(Pack<T, N> r[8]) {
   exchange_all<1>(r);
@@ -48,7 +48,7 @@ MPM_HD void store_half(const Pack<T, N>& v, int half, T* to) {
   }
 }
 
-// Lane l of field k to to[l * stride + k]; Fields is a multiple of 8.
+// Stores lane l of field k at to[l * stride + k]; Fields is a multiple of 8.
 template <int Fields, class T, int N>
 MPM_HD void store_transposed(Pack<T, N> field[Fields], T* to, int stride) {
   MPM_UNROLL for (int first = 0; first < Fields; first += 8) {

@@ -4,8 +4,8 @@
 
 namespace mpm::cuda {
 
-// Barrier of `blocks` thread blocks that all run at once; `arrived` is zero before the first one. That of cooperative
-// groups asks for the last block without a pause, which slows down those that are still at work.
+// Barrier of `blocks` concurrent thread blocks; `arrived` is zero before the first one. The barrier of cooperative
+// groups polls for the last block without a pause, which slows down blocks that are still at work.
 __device__ inline void wait_for_blocks(unsigned* arrived, unsigned blocks) {
   __syncthreads();
   if (threadIdx.x == 0) {
@@ -17,16 +17,16 @@ __device__ inline void wait_for_blocks(unsigned* arrived, unsigned blocks) {
   __syncthreads();
 }
 
-// The same for a chain of barriers of one kernel, where nothing else is to be done meanwhile. What thread blocks have
-// counted is added up on the way, so that nobody has to ask for it once more.
+// The same for consecutive barriers of one kernel without other work in between. Counts of thread blocks are summed
+// with the barrier, so that they need not be read separately.
 struct Barrier {
-  // Two that take turns, zero before the kernel, with the counts in the upper half: who is late still finds what was
-  // counted up to this barrier alone.
+  // Two that alternate, zero before the kernel, with the counts in the upper half: a late block still finds the counts
+  // up to this barrier only.
   unsigned long long* arrived;
   unsigned blocks, number = 0;
 
-  // Returns all counts of every other barrier up to this one. `count()` is asked of thread 0 when all threads of its
-  // block are there.
+  // Returns all counts of every other barrier up to this one. `count()` is called by thread 0 when all threads of its
+  // block have arrived.
   template <class Count>
   __device__ unsigned wait(const Count& count) {
     __shared__ unsigned sum;
@@ -47,7 +47,7 @@ struct Barrier {
   }
 };
 
-// Whether all thread blocks of a kernel are one cluster, as launch_at_once() makes of few.
+// Whether all thread blocks of a kernel are one cluster, as launch_at_once() makes for few.
 __device__ inline bool is_cluster() {
 #if __CUDA_ARCH__ >= 900
   return cooperative_groups::this_cluster().num_blocks() == gridDim.x;
@@ -62,7 +62,7 @@ __device__ inline void wait_for_cluster() {
 #endif
 }
 
-// What thread block `block` of a cluster has in the place of `mine`, in shared memory.
+// Counterpart of `mine` of thread block `block` of a cluster, in shared memory.
 template <class T>
 __device__ const T* in_block_of_cluster(T* mine, unsigned block) {
 #if __CUDA_ARCH__ >= 900

@@ -3,7 +3,7 @@
 #include "common/matrix.h"
 #include "cuda/schedule.h"
 
-// Where a particle lies in its base block.
+// Position of a particle in its base block.
 namespace mpm::cuda {
 
 template <class T, int D>
@@ -11,8 +11,8 @@ __device__ int scene_of(const Topology<T, D>& t, int block) {
   return t.scenes > 1 ? block / t.geometry.blocks_per_scene : 0;
 }
 
-// Base node relative to the base block, and the distances from it. False for a particle that is not in its base block:
-// its position is not the one that was activated.
+// Base node relative to the base block, and the distances from it. False for a particle outside its base block: its
+// position is not that of the activation.
 template <int Order, class T, int D>
 __device__ bool locate_in_block(const Topology<T, D>& t, int scene, int base_block, const Vector<T, D>& x, int* base,
                                 T* f) {
@@ -26,8 +26,8 @@ __device__ bool locate_in_block(const Topology<T, D>& t, int scene, int base_blo
   return inside && block_index(t.geometry, scene, block) == base_block;
 }
 
-// The slot of the block with the base node of a particle, wherever that is, -1 where there is none; and the base node
-// relative to it, and the distances from that.
+// Slot of the block with the base node of a particle, anywhere, -1 where there is none; and the base node relative to
+// it, and the distances from that.
 template <int Order, class T, int D>
 __device__ int locate_slot(const Topology<T, D>& t, int scene, const Vector<T, D>& x, int* base, T* f) {
   if (!locate<Order>(t.geometry, x.e, base, f)) return -1;
@@ -40,8 +40,8 @@ __device__ int locate_slot(const Topology<T, D>& t, int scene, const Vector<T, D
   return t.table[block_index(t.geometry, scene, block)];
 }
 
-// The blocks that the support of a base node reaches, given relative to its own: a bit for each of the neighbours in
-// the schedule.
+// Blocks in the support of a base node, given relative to its own block: a bit for each of the neighbours in the
+// schedule.
 template <int Order, int D>
 __device__ unsigned touched_blocks(const int* base) {
   unsigned touched = 1;
@@ -60,14 +60,14 @@ __device__ int further(const Geometry<T, D>& g, int o) {
   return way;
 }
 
-// Particles of an item or a batch, counted from its first, that are not in their base block; in shared memory.
+// Particles of an item or a batch, counted from its first, that are outside their base block; in shared memory.
 template <int Most>
 struct Strays {
   int count;
   uint16_t particle[Most];
 };
 
-// The base block of a thread block: its base nodes lie in [first, end), as numbers of type T.
+// Base block of a thread block: its base nodes lie in [first, end), as numbers of type T.
 template <class T, int D>
 struct BaseBlock {
   int scene;
@@ -84,14 +84,14 @@ struct BaseBlock {
       end[i] = min(first[i] + T(kBlockWidth), T(t.geometry.blocks[i] * kBlockWidth - Order));
     }
   }
-  // Cell of x in the block, counted as its base node is, and the distances from that node. False for a particle that is
-  // not in its base block: its position is not the one that was activated.
+  // Cell of x in the block, counted as its base node is, and the distances from that node. False for a particle outside
+  // its base block: its position is not that of the activation.
   template <int Order>
   __device__ bool locate(const Geometry<T, D>& g, const Vector<T, D>& x, int& cell, T* f) const {
     bool inside = true;
     T place = T(0);
 #pragma unroll
-    for (int i = 0; i < D; i++) {  // no early return: it would make each coordinate wait for the one before
+    for (int i = 0; i < D; i++) {  // no early return: each coordinate would wait for the previous one
       const T node = base_node<Order>(g, i, x[i]);
       inside = inside && node >= first[i] && node < end[i];  // false for NaN
       place = place * T(kBlockWidth) + (node - first[i]);

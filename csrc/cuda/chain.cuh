@@ -2,12 +2,12 @@
 
 #include "cuda/launch.cuh"
 
-// Kernels of a step, which mostly follow one another: each is launched while the one before it is at work, and waits
-// for that. Compiled for compute capability 9.0 or later; else they are launched as any other.
+// Consecutive kernels of a step: each is launched while the previous one runs, and waits for it (programmatic dependent
+// launch). For compute capability 9.0 or later; otherwise they are launched as usual.
 namespace mpm::cuda {
 
-// Whether a kernel was compiled to wait: PTX of an older architecture, which newer devices take too, was not. All
-// kernels are compiled for the same ones.
+// Whether a kernel was compiled with this wait: PTX of an older architecture, which newer devices accept too, was not.
+// All kernels are compiled for the same architectures.
 template <class Kernel>
 bool waits_for_kernel_before(Kernel* kernel) {
   const auto compiled_for = [&] {
@@ -25,9 +25,9 @@ __device__ inline void let_next_kernel_begin() {
 #endif
 }
 
-// What every thread of a kernel that is launched in a chain does, once or more often: before it reads what the kernel
-// before has written, and before it ends. The next one comes after that, so what it does before it waits in turn may
-// read what was written before the kernel before it.
+// To be called by every thread of a kernel launched in a chain, once or more often: before it reads results of the
+// previous kernel, and before it ends. The next kernel starts afterwards, so before its own wait it may read results of
+// kernels before its predecessor.
 __device__ inline void wait_for_kernel_before() {
 #if __CUDA_ARCH__ >= 900
   cudaGridDependencySynchronize();
@@ -65,10 +65,10 @@ void launch_in_chain(void (*kernel)(Parameters...), unsigned blocks, unsigned th
   check(cudaLaunchKernelEx(&config, kernel, Parameters(arguments)...));
 }
 
-constexpr unsigned kLargestCluster = 16;  // of which not every device takes more than 8
+constexpr unsigned kLargestCluster = 16;  // not every device supports more than 8
 
-// Thread blocks that run all at once and may wait for each other, by wait_for_all(): a few as one cluster, whose
-// barriers are faster, in a chain like launch_in_chain(). The kernel must call wait_for_kernel_before() first of all.
+// Concurrent thread blocks that may wait for each other, by wait_for_all(): few as one cluster, whose barriers are
+// faster, in a chain like launch_in_chain(). The kernel must call wait_for_kernel_before() first of all.
 template <class... Parameters, class... Arguments>
 void launch_at_once(void (*kernel)(Parameters...), unsigned blocks, unsigned threads, size_t shared_memory,
                     cudaStream_t stream, const Arguments&... arguments) {
@@ -80,14 +80,14 @@ void launch_at_once(void (*kernel)(Parameters...), unsigned blocks, unsigned thr
   attributes[1].val.clusterDim = {blocks, 1, 1};
   const cudaLaunchConfig_t config = launch_config(attributes, 2, blocks, threads, shared_memory, stream);
   const auto takes_cluster = [&] {
-    cudaLaunchConfig_t cluster = config;  // without the chain
+    cudaLaunchConfig_t cluster = config;  // without a chain
     cluster.attrs = attributes + 1;
     cluster.numAttrs = 1;
     int clusters = 0;
     if (cudaFuncSetAttribute(kernel, cudaFuncAttributeNonPortableClusterSizeAllowed, 1) == cudaSuccess &&
         cudaOccupancyMaxActiveClusters(&clusters, kernel, &cluster) == cudaSuccess)
       return clusters > 0;
-    cudaGetLastError();  // which is no error: the device takes no such cluster
+    cudaGetLastError();  // not an error: the device does not support such a cluster
     return false;
   };
   struct Answer {

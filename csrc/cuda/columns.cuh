@@ -7,7 +7,7 @@
 #include "common/fields.h"
 #include "common/matrix.h"
 
-// Particle fields as the transfer kernels read and write them.
+// Particle fields in the form of the transfer kernels.
 namespace mpm::cuda {
 
 // The N entries of a particle field as separate pointers, so that an address is one multiply-add away from the

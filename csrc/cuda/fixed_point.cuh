@@ -3,17 +3,17 @@
 #include "grid/fixed_point.h"
 #include "grid/grid_update.h"
 
-// Rows of nodes in whole units: mass, then momentum, 64 bits each.
+// Rows of nodes in integer units: mass, then momentum, 64 bits each.
 namespace mpm::cuda {
 
-constexpr long long kNotANumber = 1ll << (kUnitBits + 1);  // in the mass, whatever is added to it
+constexpr long long kNotANumber = 1ll << (kUnitBits + 1);  // in the mass, for any added value
 
 __device__ inline float power_of_two(int exponent) {
   return __int_as_float((::min(::max(exponent, -126), 126) + 127) << 23);
 }
 
 struct FixedUnits {
-  float mass, momentum;  // units in 1 of each
+  float mass, momentum;  // units per mass and momentum
 
   __device__ explicit FixedUnits(const FixedPoint& fixed) {
     const int exponent = (*fixed.largest_mass >> 23) - 126;  // the largest mass is below two to this
@@ -23,7 +23,7 @@ struct FixedUnits {
   __device__ float of(int channel) const { return channel == 0 ? mass : momentum; }
 };
 
-// What is not finite, or larger than any sum may be, makes the node one of no number.
+// A value that is not finite, or larger than any possible sum, makes the node invalid.
 __device__ inline void add_fixed(long long* row, int channel, float value, const FixedUnits& units) {
   const float scaled = value * units.of(channel);
   const bool fits = fabsf(scaled) < float(1ll << kUnitBits);  // false for NaN

@@ -24,23 +24,23 @@ inline int device_attribute(cudaDeviceAttr attribute) {
   return value;
 }
 
-// Thread blocks for `count` pieces of work that a kernel takes in strides of its grid. Many more than fit at once, so
-// that the hardware balances them, but not so many that empty ones cost time when `count` is a generous bound.
+// Thread blocks for `count` pieces of work in a grid-stride loop. Many more than fit at once, so that the hardware
+// balances them, but not so many that empty ones cost time when `count` is a generous bound.
 inline unsigned grid_size(int64_t count) {
   const int processors = device_attribute(cudaDevAttrMultiProcessorCount);
   return unsigned(std::clamp<int64_t>(count, 1, int64_t(processors) * 128));
 }
 
-// The same for a task that may say that it mostly has nothing to do: each thread block costs time then, too.
+// The same for a task that may state that it mostly has nothing to do: each thread block then costs time, too.
 template <class Task>
 unsigned grid_size(const Task& task, int64_t count) {
-  constexpr unsigned share = 8;  // one in so many is enough
+  constexpr unsigned share = 8;  // one in this number is enough
   if constexpr (requires { task.is_mostly_idle(); })
     if (task.is_mostly_idle()) return std::max(grid_size(count) / share, 1u);
   return grid_size(count);
 }
 
-// What exceeds 48 KB has to be asked for, and what a kernel declares itself counts too: up to 16 KB.
+// Shared memory above 48 KB must be requested, and statically declared memory counts too: up to 16 KB.
 template <class Kernel>
 void allow_shared_memory(Kernel* kernel, size_t shared_memory) {
   if (shared_memory > 32 * 1024)
@@ -55,7 +55,7 @@ void launch(void (*kernel)(Parameters...), unsigned blocks, unsigned threads, si
   check(cudaGetLastError());
 }
 
-// Thread blocks that run all at once and may wait for each other, as many as the device takes of `blocks`.
+// Concurrent thread blocks that may wait for each other, as many of `blocks` as fit on the device.
 template <class... Parameters, class... Arguments>
 void launch_together(void (*kernel)(Parameters...), unsigned blocks, unsigned threads, size_t shared_memory,
                      cudaStream_t stream, Arguments... arguments) {

@@ -2,7 +2,7 @@
 
 namespace mpm::cuda {
 
-// Four values that one access to memory takes: four channels of a node, or a row of nodes of a block.
+// Four values in one memory access: four channels of a node, or a row of nodes of a block.
 template <class T>
 struct alignas(16) Quad {
   T e[4];

@@ -5,8 +5,8 @@
 // The schedule tensor of the CUDA kernels.
 namespace mpm::cuda {
 
-// Particles of an item at most, all of one base block: a crowded block makes several items. Fewer where there are few
-// particles, so that there are some two items for each of the 130 multiprocessors of a large device.
+// Maximum number of particles of an item, all of one base block: a crowded block makes several items. Smaller where
+// there are few particles, so that there are about two items for each of the 130 multiprocessors of a large device.
 constexpr int kItemParticles = 576, kLeastItemParticles = 128;
 
 MPM_HD int item_particles(int64_t particles) {
@@ -23,7 +23,7 @@ struct Item {
 template <class I>
 struct Schedule {
   I* item_count;
-  I* scattered;   // whether particles that are neighbours in memory mostly lie in different blocks
+  I* scattered;   // whether neighbours in memory mostly lie in different blocks
   I* items;       // [room_for_items(), 4], each an Item
   I* neighbours;  // [max_blocks, 2^D] slots of a block and of the blocks after it, -1 where inactive; the bit of axis i
                   // is D - 1 - i
@@ -36,7 +36,7 @@ MPM_HD int64_t most_items(int64_t max_blocks, int64_t particles) {
   return (max_blocks < particles ? max_blocks : particles) + particles / item_particles(particles);
 }
 
-// As many, without a division that each thread would have to do.
+// A bound without a division in each thread.
 MPM_HD int64_t room_for_items(int64_t max_blocks, int64_t particles) {
   return (max_blocks < particles ? max_blocks : particles) + particles / kLeastItemParticles;
 }

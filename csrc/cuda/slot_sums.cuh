@@ -7,13 +7,13 @@ namespace mpm::cuda {
 
 constexpr int kSlotTurns = 32, kSlotColumns = 32;  // of a thread block at a time
 
-// A thread block has a row, and adds up its slots in a fixed order. Slots are in the order of their blocks, so those of
+// One row per thread block, which sums its slots in a fixed order. Slots are in the order of their blocks, so those of
 // a scene are neighbours, and unused ones come last.
 template <class Value>
 __global__ void __launch_bounds__(kSlotTurns* kSlotColumns) slot_sums_kernel(const SlotSums<Value> a) {
   __shared__ double sums[kSlotTurns][kSlotColumns];
   const int row = blockIdx.x, turn = threadIdx.x / kSlotColumns, lane = threadIdx.x % kSlotColumns;
-  const auto first_from = [&](int64_t least) {  // slot whose block is `least` or a later one
+  const auto first_from = [&](int64_t least) {  // slot of block `least` or of a later one
     int begin = 0, end = a.max_blocks;
     while (begin < end) {
       const int middle = begin + (end - begin) / 2;

@@ -16,7 +16,7 @@ void assume_contiguous(F&... field) {
   ((field.stride[0] = 1), ...);
 }
 
-// With the particle stride known to be 1 the compiler vectorises the loop over particles.
+// With a particle stride of 1 known at compile time the compiler vectorises the loop over particles.
 template <bool Contiguous, class T, int D>
 void advance_range(AdvanceArguments<T, D> a, int64_t begin, int64_t end) {
   if (Contiguous) assume_contiguous(a.x, a.velocity, a.affine, a.F, a.J, a.x_next, a.F_next, a.J_next);

@@ -4,10 +4,10 @@
 #include "transfer/arguments.h"
 #include "transfer/own_rows.h"
 
-// The end of a symplectic Euler step, with the velocity and the affine field just gathered:
+// End of a symplectic Euler step, with the gathered velocity and affine field:
 //   x ← x + dt v,   F ← (I + dt C) F,   J ← J (1 + dt tr C).
-// Compensated positions carry the residual that rounding has left out of x, so that motion below half a unit in the
-// last place of x is not lost.
+// Compensated positions carry the accumulated rounding error of x, so that motion below half a unit in the last place
+// of x is not lost.
 namespace mpm {
 
 template <class T, int D>
@@ -24,21 +24,21 @@ struct AdvanceArguments {
 
 template <class T, int D>
 struct AdvanceBackwardArguments {
-  AdvanceArguments<T, D> forward;                   // its outputs unused
+  AdvanceArguments<T, D> forward;                   // its outputs are unused
   Field<const T> grad_x, grad_F, grad_J;            // adjoints of the outputs; the last two absent with F and J
   Field<T> velocity, affine, F, J, dt;              // adjoints per particle; absent where not needed
-  bool adds_velocity = false, adds_affine = false;  // to what is there
+  bool adds_velocity = false, adds_affine = false;  // added to the present values
 };
 
-// The adjoint of G2P and the end of the step in one: that of the end, and then the sums over the particles of what it
-// leaves at the adjoints of their motion.
+// Adjoint of G2P and the end of the step in one: the adjoint of the end, followed by the sums over the particles of its
+// result at the adjoints of their motion.
 template <class T, int D>
 struct G2PAdvanceBackwardArguments {
-  AdvanceBackwardArguments<T, D> advance;  // its velocity and affine, or velocity gradient, are what is added up
+  AdvanceBackwardArguments<T, D> advance;  // its velocity and affine, or velocity gradient, are scattered
   ScatterArguments<T, D> scatter;          // D channels
 };
 
-// G2P and the end of the step in one: the velocity gradient that moves F and J is the affine field (MLS) or ∇v.
+// G2P and the end of the step in one: the velocity gradient of F and J is the affine field (MLS) or ∇v.
 template <class T, int D>
 struct G2PAdvanceArguments {
   GatherArguments<T, D> gather;  // of the node velocities; value is v, moment C (may be absent), gradient unused
@@ -48,23 +48,23 @@ struct G2PAdvanceArguments {
   double dt = 0;
   StressForm form = StressForm::mls;
   Field<T> x_next, F_next, J_next, residual_next;
-  bool late = false;  // F and J are left to P2G, where there is a LateDeformation; on CUDA
-  // On CUDA: particles may be in other active blocks than they were activated in, and where they go now is added here.
+  bool late = false;  // F and J are updated by P2G, where there is a LateDeformation; on CUDA
+  // On CUDA: particles may be in active blocks other than those of the activation, and their new places are counted
+  // here.
   Drift* drift = nullptr;
   GivingBack<T> own;  // on CUDA
-  // On CUDA: whether the kernel before writes nothing that this one reads but the nodes, so that it can begin to load
-  // all else meanwhile.
+  // On CUDA: whether the previous kernel writes only nodes of the inputs of this one, so that it can load all other
+  // inputs meanwhile.
   bool loads_ahead = false;
 };
 
 constexpr int64_t kMostLateParticles = 1 << 18;
 
-// The motion of F or J that G2P leaves to the next P2G, which loads them anyway and has the affine field that moves
-// them.
+// Update of F or J that G2P defers to the next P2G, which loads them anyway and has the affine field for it.
 template <class T, int D>
 struct LateDeformation {
-  Field<T> state;              // where the moved F or J goes, perhaps where it was; absent where G2P moves it itself
-  bool moves = false;          // whether a G2P has left something
+  Field<T> state;              // destination of the updated F or J, possibly in place; absent where G2P updates it
+  bool moves = false;          // whether a G2P has deferred an update
   const int* scene = nullptr;  // [P], where scenes have time steps of their own
   int64_t scene_stride = 0;
 };
@@ -76,7 +76,7 @@ MPM_HD Vector<T, D> advance_position(const Vector<T, D>& x, const Vector<T, D>& 
   return x + dt * v;
 }
 
-// The compensated position; `residual` becomes that of the result, exactly (TwoSum: Knuth 1969).
+// Compensated position; `residual` becomes that of the result, exactly (TwoSum: Knuth 1969).
 template <class T, int D>
 MPM_HD Vector<T, D> advance_position(const Vector<T, D>& x, const Vector<T, D>& v, const T& dt,
                                      Vector<T, D>& residual) {
@@ -100,7 +100,7 @@ MPM_HD T advance_volume_ratio(const T& J, const Matrix<T, D>& C, const T& dt) {
   return J + dt * trace(C) * J;
 }
 
-// Time step of a particle. A scene id out of range takes that of scene 0: such a particle is not transferred anyway.
+// Time step of a particle. An invalid scene id gets that of scene 0: such a particle is not transferred anyway.
 template <class T, int D>
 MPM_HD T particle_dt(const AdvanceArguments<T, D>& a, const One<T>& at) {
   if (!a.scene_dt.pointer) return T(a.dt);
@@ -118,8 +118,8 @@ MPM_HD void advance_particle(const AdvanceArguments<T, D>& a, const One<T>& at) 
   if (a.J.pointer) store_scalar(at, a.J_next, advance_volume_ratio(load_scalar(at, a.J), C, dt));
 }
 
-// The velocity and the affine field that moved a particle. Those of a particle whose position is not finite are NaN and
-// count as zero: it stays as it is, and must not spoil the gradients of others.
+// Velocity and affine field of the motion of a particle. Those of a particle whose position is not finite are NaN and
+// count as zero: it is unchanged, and must not affect the gradients of others.
 template <class T, int D>
 MPM_HD void load_motion(const AdvanceArguments<T, D>& a, const One<T>& at, Vector<T, D>& v, Matrix<T, D>& C) {
   const bool moves = is_finite<D>(load_vector<D>(at, a.x).e);
@@ -132,14 +132,14 @@ MPM_HD void load_motion(const AdvanceArguments<T, D>& a, const One<T>& at, Vecto
   }
 }
 
-// Adjoints of what moved a particle.
+// Adjoints of the motion of a particle.
 template <class T, int D>
 struct MotionAdjoint {
   Vector<T, D> velocity;
   Matrix<T, D> affine;
 };
 
-// Returns what is at its places for those of the motion afterwards.
+// Returns the adjoints of the inputs, given those of the motion afterwards.
 template <class T, int D>
 MPM_HD MotionAdjoint<T, D> advance_particle_backward(const AdvanceBackwardArguments<T, D>& a, const One<T>& at) {
   const T dt = particle_dt(a.forward, at);

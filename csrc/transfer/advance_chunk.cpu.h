@@ -3,11 +3,11 @@
 #include "transfer/advance.h"
 #include "transfer/gather.cpu.h"
 
-// The end of a step for a chunk of particles, after the sums of G2P.
+// End of a step for a chunk of particles, after the sums of G2P.
 namespace mpm::cpu {
 inline namespace TORCH_MPM_ISA {
 
-// The fields of the particles, by rows.
+// Fields of the particles, by rows.
 template <class T, int D>
 struct AdvancedRows {
   FieldRows<const T, D> x, residual;
@@ -29,7 +29,8 @@ struct AdvancedRows {
         F_next(a.F_next, D),
         J_next(a.J_next) {}
 
-  // Asks for the cache lines of a particle, where all strides are 1. GCC leaves out calls of functions that do no more.
+  // Prefetches the cache lines of a particle, where all strides are 1. GCC removes calls of functions that do only
+  // this.
   MPM_HD void expect(int p) const {
     if (x.row[0] != x_next.row[0]) {
       expect<false>(x, p);
@@ -50,7 +51,7 @@ struct AdvancedRows {
   }
 };
 
-// What a step changes of a pack of particles.
+// Fields that a step changes, for a pack of particles.
 template <class P, int D>
 struct Advanced {
   Vector<P, D> x, v, residual;
@@ -58,7 +59,7 @@ struct Advanced {
   P J;
 };
 
-// The particles of a group or a run as they are; zero for absent fields.
+// Unchanged values of the particles of a group or a run; zero for absent fields.
 template <class P, int D, class T, class G>
 MPM_HD void read(Advanced<P, D>& p, const AdvancedRows<T, D>& rows, const G& g) {
   MPM_UNROLL for (int i = 0; i < D; i++)
@@ -95,7 +96,7 @@ MPM_HD void write(const Advanced<P, D>& p, const AdvancedRows<T, D>& rows, const
   write_moved(p, rows, g);
 }
 
-// By the velocity of the particles and its gradient L.
+// Update by the velocity of the particles and its gradient L.
 template <class P, int D, class T>
 MPM_HD void end_step(Advanced<P, D>& p, const Matrix<P, D>& L, const P& dt, const AdvancedRows<T, D>& rows) {
   p.x = rows.residual ? advance_position(p.x, p.v, dt, p.residual) : advance_position(p.x, p.v, dt);
@@ -103,19 +104,19 @@ MPM_HD void end_step(Advanced<P, D>& p, const Matrix<P, D>& L, const P& dt, cons
   if (rows.J) p.J = advance_volume_ratio(p.J, L, dt);
 }
 
-// The motion of the particles of a chunk in the order of cells: packs of a cell are seldom full, those of a chunk are.
+// Motion of the particles of a chunk in the order of cells: packs of a cell are seldom full, those of a chunk are.
 template <bool Gradient, class T, int D>
 struct Motion {
-  static constexpr int kLine = kChunk + 16;  // not a power of two, and room for a whole register at the end
+  static constexpr int kLine = kChunk + 16;  // not a power of two, with space for a whole register at the end
   alignas(64) T velocity[D][kLine], affine[D][D][kLine], gradient[Gradient ? D : 1][D][kLine];
 
-  Motion() {}  // nothing is set to zero
+  Motion() {}  // no initialisation
 
   MPM_HD void put(int i, const Sums<Lanes<T>, D> s[D]) {
     put_by([&](const Lanes<T>& v, T* row) { v.store(row + i); }, s);
   }
 
-  // By store(values, row), of a group or of one particle.
+  // By store(values, row), for a group or a single particle.
   template <class F, class V>
   MPM_HD void put_by(const F& store, const Sums<V, D> s[D]) {
     MPM_UNROLL for (int c = 0; c < D; c++) {
@@ -127,7 +128,7 @@ struct Motion {
     }
   }
 
-  // The velocity and the affine field of the i-th particle and those after it, and the gradient of the velocity.
+  // Velocity, affine field and gradient of the velocity of the i-th particle and the following ones.
   template <class P>
   MPM_HD void get(int i, const P& scale, const P& inverse_dx, Advanced<P, D>& p, Matrix<P, D>& L) const {
     MPM_UNROLL for (int c = 0; c < D; c++) {
@@ -140,7 +141,7 @@ struct Motion {
   }
 };
 
-// The end of a step for particles that are not transferred.
+// End of the step for particles that are not transferred.
 template <class T, int D>
 void leave_outside(const G2PAdvanceArguments<T, D>& a) {
   for_outside(a.gather.topology, [&](int64_t p) {

@@ -11,7 +11,7 @@ struct Motion {
   Matrix<T, D> affine;
 };
 
-// G2P with the end of the step, so that v and C need not be read again. Where it is not to Move F and J, P2G does.
+// G2P with the end of the step, so that v and C need not be read again. Without Move, P2G updates F and J.
 template <int Order_, class T_, int D_, bool Gradient, bool Drifts, bool Moves = true>
 struct AdvanceGather {
   using T = T_;
@@ -34,7 +34,7 @@ struct AdvanceGather {
   Columns<T, D * D> affine, F_next;
   Columns<T, 1> J_next;
   Field<const T> scene_dt;
-  T dt, moment_scale, gradient_scale;  // from cells
+  T dt, moment_scale, gradient_scale;  // converts from cells
   T lost;
   Drift* drift;
   bool loads_ahead;
@@ -70,7 +70,7 @@ struct AdvanceGather {
       for (int j = 0; j < D; j++) l.F[i][j] = F.present() ? F.at(p, i * D + j) : T(0);
     return l;
   }
-  // Of a particle at x whose F and J are left alone.
+  // For a particle at x with unchanged F and J.
   __device__ Loaded at(const mpm::Vector<T, D>& x, int scene) const {
     Loaded l;
     l.x = x;
@@ -99,9 +99,9 @@ struct AdvanceGather {
     }
     return m;
   }
-  // Returns where the particle goes.
+  // Returns the new place of the particle.
   __device__ mpm::Vector<T, D> write(int p, const Loaded& l, const Result& s) const { return write(p, p, p, l, s); }
-  // The motion goes to a row of its own, the others to row `to`.
+  // The motion is written to its own row, the other fields to row `to`.
   __device__ mpm::Vector<T, D> write(int p, int of_motion, int to, const Loaded& l, const Result& s) const {
     const Motion<T, D> m = motion(s);
     Matrix<T, D> L;
@@ -126,7 +126,7 @@ struct AdvanceGather {
     J_next.write(to, 0, advance_volume_ratio(l.J, L, l.dt));
     return x;
   }
-  // The position. Residuals are loaded here, where no other registers are in use, as most scenes have none.
+  // New position. Residuals are loaded here, where no other registers are in use, as most scenes have none.
   __device__ mpm::Vector<T, D> advanced(int p, int to, const mpm::Vector<T, D>& x, const mpm::Vector<T, D>& v,
                                         const T& time_step) const {
     if (!residual.present()) return advance_position(x, v, time_step);
@@ -155,8 +155,8 @@ struct AdvanceGather {
   }
 };
 
-// Of particles that the call owns: before a new activation, with F and J left to P2G; or at the end, when they move and
-// all goes to the places in the given tensors.
+// For particles owned by the call: before a new activation, with F and J updated by P2G; or at the end, when all fields
+// are written to their places in the given tensors.
 template <class T, int D, bool Ends>
 struct OwnAdvanceGather : AdvanceGather<2, T, D, false, true, Ends> {
   using Base = AdvanceGather<2, T, D, false, true, Ends>;

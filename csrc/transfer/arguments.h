@@ -16,12 +16,12 @@ struct P2GArguments {
   double dt = 0;
   StressForm form = StressForm::mls;
   bool deterministic = false;
-  bool drifted = false;  // particles may be in other active blocks than they were activated in; with stress, on CUDA
+  bool drifted = false;  // particles may be in active blocks other than those of the activation; with stress, on CUDA
   NodeField<T> nodes;    // zero on entry; 1 + D channels: mass, momentum
-  FixedPoint fixed;      // of the nodes, on CUDA
+  FixedPoint fixed;      // sums of the nodes, on CUDA
 };
 
-// ∂Φ/∂x_p of the trilinear form Φ = Σ_p Σ_i g_i · [N_i (value_p + scale moment_p (x_i − x_p)) + gradient_p ∇N_i] that
+// ∂Φ/∂x_p of the trilinear form Φ = Σ_p Σ_i g_i · [N_i (value_p + scale moment_p (x_i − x_p)) + gradient_p ∇N_i], which
 // has scatter as ∂Φ/∂g and gather as ∂Φ/∂(value, moment, gradient): the position gradient of both.
 template <class T, int D>
 struct PositionGradientArguments {
@@ -30,17 +30,17 @@ struct PositionGradientArguments {
   NodeField<const T> nodes;  // g
   double moment_scale = 1;
   Field<T> position_gradient;  // [P, D], zero for particles outside
-  bool adds = false;           // to what is there
+  bool adds = false;           // added to the present values
 };
 
 template <class T, int D>
 struct P2GBackwardArguments {
-  P2GArguments<T, D> forward;  // its `nodes` unused
+  P2GArguments<T, D> forward;  // its `nodes` are unused
   NodeField<const T> grad_nodes;
   Field<T> x, mass, velocity, affine, stress, volume,
       dt;             // adjoints per particle, dt with respect to the product dt * scene_dt; absent where not needed
-  bool adds = false;  // x, mass and volume to what is there
-  // Of the G2P of the same step, whose position gradient comes first: it may read what is written here. Absent without
+  bool adds = false;  // x, mass and volume: added to the present values
+  // Position gradient of the G2P of the same step, which comes first: it may read the outputs of this. Absent without
   // nodes.
   PositionGradientArguments<T, D> motion;
 };
@@ -56,15 +56,15 @@ struct ScatterArguments {
   NodeField<T> nodes;  // zero on entry, K channels
 };
 
-// The adjoint of scatter: value_p = Σ_i N_i g_i, moment_p = scale Σ_i N_i g_i (x_i − x_p), gradient_p = Σ_i g_i ∇N_i.
+// Adjoint of scatter: value_p = Σ_i N_i g_i, moment_p = scale Σ_i N_i g_i (x_i − x_p), gradient_p = Σ_i g_i ∇N_i.
 template <class T, int D>
 struct GatherArguments {
   Topology<T, D> topology;
   Field<const T> x;
   NodeField<const T> nodes;
   double moment_scale = 1;
-  double lost = 0;                   // what a particle gets whose position is not finite
-  Field<T> value, moment, gradient;  // absent where not wanted; zero for other particles outside
+  double lost = 0;                   // result of particles whose position is not finite
+  Field<T> value, moment, gradient;  // absent where not requested; zero for other particles outside
 };
 
 }  // namespace mpm

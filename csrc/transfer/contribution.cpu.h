@@ -4,7 +4,7 @@
 #include "cpu/tile.h"
 #include "transfer/arguments.h"
 
-// What particles give to their nodes, in the form that the sums of scatter.h and gather.h take:
+// Contributions of particles to their nodes, in the form of the sums of scatter.h and gather.h:
 //   node k += N_k (value + slope · k) + gradient · ∇N_k,
 // with k counted from the base node, and distances in cells.
 namespace mpm::cpu {
@@ -25,7 +25,7 @@ MPM_HD Matrix<Pack<T, G::kSize>, D> load_matrix_or_zero(const Field<const T>& f,
   return r;
 }
 
-// The inputs of a GroupOf or RunOf particles.
+// Inputs of a GroupOf or RunOf particles.
 template <class T, int D, class G>
 MPM_HD ParticleMomentum<Pack<T, G::kSize>, D> load_momentum(const P2GArguments<T, D>& a, const G& g, int scene) {
   using P = Pack<T, G::kSize>;
@@ -40,7 +40,7 @@ MPM_HD ParticleMomentum<Pack<T, G::kSize>, D> load_momentum(const P2GArguments<T
   return p;
 }
 
-// With the form and what there is known when compiling, all of it stays in registers; absent fields are zero.
+// With the form and the present fields known at compile time, all of it stays in registers; absent fields are zero.
 template <int Order, bool Slope, bool Gradient, class T, class P, int D>
 MPM_HD Contribution<P, D> momentum_contribution(const Geometry<T, D>& geometry, const ParticleMomentum<P, D>& p,
                                                 const P f[D]) {

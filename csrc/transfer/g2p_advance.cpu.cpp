@@ -23,7 +23,7 @@ void g2p_advance_with(const G2PAdvanceArguments<T, D>& a) {
       Advanced<P, D> p;
       Matrix<P, D> L;
       motion.get(i, scale, inverse_dx, p, L);
-      // One arithmetic for all, so that rounding does not depend on what is consecutive.
+      // One arithmetic for all, so that rounding does not depend on contiguity.
       const int rest = chunk.count - i;
       const bool run = direct && chunk.sorted && rest >= N;
       const GroupOf<N> g = run ? GroupOf<N>{} : group_of<N>(id + i, rest);

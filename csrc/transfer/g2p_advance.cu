@@ -7,7 +7,7 @@ void g2p_advance(const G2PAdvanceArguments<T, D>& a, Stream stream) {
   const auto with = [&]<bool Gradient, bool Drifts>() {
     launch_gather(AdvanceGather<Order, T, D, Gradient, Drifts>(a), stream);
   };
-  if constexpr (Order == 2 && sizeof(T) == sizeof(float)) {  // as there are kernels of laws in P2G
+  if constexpr (Order == 2 && sizeof(T) == sizeof(float)) {  // as for the kernels of laws in P2G
     if (a.own.rows > 0 && a.late) return launch_gather(OwnAdvanceGather<T, D, false>(a), stream);
     if (a.own.rows > 0) return launch_gather(OwnAdvanceGather<T, D, true>(a), stream);
     if (a.late) return launch_gather(AdvanceGather<Order, T, D, false, true, false>(a), stream);

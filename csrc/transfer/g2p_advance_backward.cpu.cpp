@@ -1,7 +1,7 @@
 #include "common/instantiate.h"
 #include "transfer/advance.h"
 
-// The adjoint of G2P with the end of the step, one after the other: sums of a chunk would wait for its particles.
+// Adjoint of G2P with the end of the step, one after the other: sums of a chunk would wait for its particles.
 namespace mpm::cpu {
 inline namespace TORCH_MPM_ISA {
 

@@ -10,7 +10,7 @@ void scatter(const ScatterArguments<T, D>&, Stream);
 
 namespace {
 
-// What P2G stages of a particle are the adjoints of its motion, as the adjoint of the end of the step leaves them.
+// P2G stages the adjoints of the motion of a particle, as computed by the adjoint of the end of the step.
 template <int Order, class T, int D>
 struct MotionAdjointSource {
   using Shape = ScatterShape<Order, T, D, 0, D, false>;
@@ -20,7 +20,7 @@ struct MotionAdjointSource {
   NodeField<T> nodes;
   Columns<const T, D> position;
   AdvanceBackwardArguments<T, D> advance;
-  T moment_scale;  // to cells
+  T moment_scale;  // converts to cells
 
   explicit MotionAdjointSource(const G2PAdvanceBackwardArguments<T, D>& a)
       : topology(a.scatter.topology),
@@ -47,7 +47,8 @@ struct MotionAdjointSource {
 
 }  // namespace
 
-// In one pass where the affine field moves the deformation; in a fixed order P2G goes over some particles many times.
+// In one pass where the affine field updates the deformation; in a fixed order P2G passes over some particles many
+// times.
 template <int Order, class T, int D>
 void g2p_advance_backward(const G2PAdvanceBackwardArguments<T, D>& a, Stream stream) {
   const bool moves = a.scatter.moment.pointer && !a.scatter.gradient.pointer && a.scatter.topology.max_blocks > 0;

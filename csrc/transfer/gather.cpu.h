@@ -9,13 +9,13 @@
 namespace mpm::cpu {
 inline namespace TORCH_MPM_ISA {
 
-// Weights of a pack of particles in one cell, and their derivatives where asked for.
+// Weights of a pack of particles in one cell, and their derivatives where needed.
 template <int Order, class P, int D>
 struct Weights {
   static constexpr int S = Order + 1;
   P f[D], w[D][S], dw[D][S], ddw[D][S];
 
-  // Of particles at distances f from their base nodes, in cells.
+  // For particles at distances f from their base nodes, in cells.
   MPM_HD Weights(const P distances[D], int derivatives) {
     MPM_UNROLL for (int a = 0; a < D; a++) {
       f[a] = distances[a];
@@ -60,7 +60,7 @@ MPM_HD Sums<P, D - Axis> sum_axis(const Weights<Order, P, D>& s, const F& line) 
   return r;
 }
 
-// Of one channel.
+// For one channel.
 template <int Order, int Axis, bool Moment, bool Gradient, class T, int D>
 MPM_HD Sums<Lanes<T>, D - Axis> sum_nodes(const Weights<Order, Lanes<T>, D>& s, const T* tile) {
   constexpr int stride = Tile<Order, T, D>::stride(Axis);
@@ -89,14 +89,14 @@ MPM_HD void gather_channels(const Lanes<T> f[D], const T* tile, Sums<Lanes<T>, D
 
 // The form u = Σ_i N_i g_i · (value + slope k_i) + Σ_d ∂_d N_i g_i · gradient_d of node values g and a particle's
 // contribution, over the axes from `Axis` on; its derivatives `du` by position along these; and psi_d = Σ_i N_i g_i ·
-// gradient_d of the axes before with its derivatives, from which the sums over the axes before make more of u.
+// gradient_d of the previous axes with its derivatives, from which the sums over the previous axes compute more of u.
 template <class P, int D, int Axis>
 struct Form {
   static constexpr int N = D - Axis;
   P u, du[N ? N : 1], psi[Axis ? Axis : 1], dpsi[Axis ? Axis : 1][N ? N : 1];
 };
 
-// The form at one node, of the first `Channels` channels.
+// Form at one node, of the first `Channels` channels.
 template <int Channels, bool Gradient, class T, int D>
 MPM_HD Form<Lanes<T>, D, D> form_at_node(const Contribution<Lanes<T>, D>& contribution, const T* node) {
   using P = Lanes<T>;
@@ -153,7 +153,7 @@ MPM_HD Form<Lanes<T>, D, Axis> form(const Weights<Order, Lanes<T>, D>& s, Contri
         r.dpsi[d][a] += w * line.dpsi[d][a - 1];
     }
   };
-  if constexpr (Axis == 0 || (Gradient && Axis + 1 < D)) {  // loops keep the code small
+  if constexpr (Axis == 0 || (Gradient && Axis + 1 < D)) {  // loops reduce the code size
     _Pragma("GCC unroll 1") for (int k = 0; k <= Order; k++) add(k);
   } else {
     MPM_UNROLL for (int k = 0; k <= Order; k++)
@@ -176,8 +176,8 @@ MPM_HD void add_position_gradient(const Weights<Order, Lanes<T>, D>& s, const Co
   }
 }
 
-// Chunk by chunk: begin() gives each thread a function of (base block, chunk, chunk that comes next, tile), where the
-// tile holds channels first, ..., first + count - 1.
+// Chunk by chunk: begin() returns for each thread a function of (base block, chunk, next chunk, tile), where the tile
+// holds channels first, ..., first + count - 1.
 template <int Order, class T, int D, class F>
 void gather_chunks(const Topology<T, D>& t, const NodeField<const T>& nodes, int first, int count, const F& begin) {
   const ScheduleIn s = schedule_of(t);
@@ -194,7 +194,7 @@ void gather_chunks(const Topology<T, D>& t, const NodeField<const T>& nodes, int
   });
 }
 
-// visit(group, its first place in the order of cells, distances from the base node in cells, tile at the base node) for
+// visit(group, its first index in the order of cells, distances from the base node in cells, tile at the base node) for
 // groups of particles of a cell.
 template <int Order, class T, int D, class F>
 MPM_HD void for_groups_of_cells(const Topology<T, D>& t, const Field<const T>& x, const BaseBlock<T, D>& base_block,
@@ -208,7 +208,7 @@ MPM_HD void for_groups_of_cells(const Topology<T, D>& t, const Field<const T>& x
       MPM_UNROLL for (int a = 0; a < D; a++)
         f[a] = distance_in_cells(t.geometry, a, load(x, g, a), Lanes<T>(T(base_block.corner[a] + base[a])));
       const T* at = tile.value + tile.at(base);
-      // Most cells have one group: what the compiler keeps of the nodes for a second one goes to the stack and back.
+      // Most cells have one group: node values that the compiler keeps for a second one would be spilled to the stack.
       asm volatile("" : "+r"(at));
       visit(g, i, f, at);
     }

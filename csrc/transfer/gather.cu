@@ -3,7 +3,7 @@
 // Gather, its position gradient, and the adjoint of P2G.
 namespace mpm::cuda {
 
-// The channels [first, ...) of a node field.
+// Channels [first, ...) of a node field.
 template <class T>
 NodeField<const T> nodes_from(NodeField<const T> n, int first) {
   n.pointer += first;
@@ -25,7 +25,7 @@ struct FieldGather {
   Columns<const T, D> position;
   Columns<T, K> value;
   Columns<T, K * D> moment, gradient;
-  T moment_scale, gradient_scale;  // from cells
+  T moment_scale, gradient_scale;  // converts from cells
   T lost;
 
   FieldGather(const GatherArguments<T, D>& a, int first)
@@ -80,7 +80,8 @@ void gather(const GatherArguments<T, D>& a, Stream stream) {
 
 // ---- Position gradient
 
-// Of Σ_i g_i · N_i (value + moment · r) + gradient · ∇N_i in cells, of a form with S::SlopeForm affine.
+// Position gradient of Σ_i g_i · N_i (value + moment · r) + gradient · ∇N_i in cells, for a form with S::SlopeForm
+// affine.
 template <class S, bool Gradient, class Support, class T>
 __device__ void position_slope(const Support& support, const Weights<S::Order, T, S::D>& w, const T (&value)[S::K],
                                const T (&moment)[S::K][S::D], const T (&gradient)[S::K][S::D], Sums<S>& s) {
@@ -109,7 +110,7 @@ struct FieldPositionGradient {
   Columns<const T, K * D> moment, gradient;
   Columns<T, D> out;
   T moment_scale, inverse_dx;
-  bool adds;  // to what is there, or to the channels before
+  bool adds;  // added to the present values, or to those of the previous channels
 
   FieldPositionGradient(const PositionGradientArguments<T, D>& a, int first)
       : topology(a.topology),

@@ -4,10 +4,10 @@
 #include "cuda/quad.cuh"
 #include "transfer/momentum.cuh"
 
-// G2P, gather, and the two adjoints that read nodes. A thread takes a particle and sums over its support one axis at a
-// time. Particles come in one of two orders, which `activate` chooses: item by item, with the nodes of the base block
-// in shared memory; or, when neighbours in memory are no neighbours in space, in the order of memory, so that at least
-// the particle fields are read and written at full width.
+// G2P, gather, and the two adjoints that read nodes. A thread processes one particle and sums over its support one axis
+// at a time. The order of particles is one of two, chosen by `activate`: item by item, with the nodes of the base block
+// in shared memory; or, when neighbours in memory are not neighbours in space, in memory order, so that at least the
+// particle fields are read and written at full width.
 namespace mpm::cuda {
 
 // Weights of the nodes of the support, their derivatives per cell, and the distances of the nodes in cells.
@@ -28,7 +28,7 @@ struct Weights {
   }
 };
 
-// Which sums over the nodes are wanted, with N a weight, r a distance, g a node value:
+// Requested sums over the nodes, with N a weight, r a distance, g a node value:
 //   value     Σ N g
 //   moment    Σ N g r, and
 //   gradient  Σ ∇N g, both without the first `Plain` channels
@@ -55,14 +55,14 @@ __device__ void accumulate(T& sum, T weight, T value) {
   sum = First ? weight * value : sum + weight * value;
 }
 
-// For each of the blocks that are left when the leading axes are decided, the row that the base node would have if the
-// nodes went on beyond the block; a node of the support is a constant distance further.
+// For each of the remaining blocks after the leading axes are fixed: the row that the base node would have if the nodes
+// continued beyond the block; a node of the support is a constant distance further.
 template <int Blocks>
 struct BlockRows {
   int row[Blocks];
 };
 
-// Whether nodes are fetched as one aligned quadruple: four channels, or a velocity that lies behind the mass.
+// Whether nodes are loaded as one aligned quadruple: four channels, or a velocity that follows the mass.
 template <int K, class T>
 bool is_vector(const NodeField<const T>& n) {
   const auto aligned = [&](int shift) { return reinterpret_cast<uintptr_t>(n.pointer - shift) % (4 * sizeof(T)) == 0; };
@@ -82,7 +82,7 @@ __device__ void load_node(const NodeField<const T>& nodes, int row, int offset, 
   }
 }
 
-// Nodes between a node and the next one along an axis with so many axes after it, in a cube.
+// Nodes between a node and the next one along an axis that is followed by `axes` axes, in a cube.
 constexpr int step_in_cube(int width, int axes) { return axes > 0 ? width * step_in_cube(width, axes - 1) : 1; }
 
 // Nodes in global memory, in the base block and the blocks after it.
@@ -110,7 +110,7 @@ struct GridSupport {
   __device__ void load(int row, int offset, T (&node)[K]) const { load_node<Quads>(nodes, row, offset, node); }
 };
 
-// K node channels in shared memory, padded so that one load fetches them.
+// K node channels in shared memory, padded so that one load reads them.
 template <class T, int K>
 struct alignas(K == 1   ? sizeof(T)
                : K == 2 ? 2 * sizeof(T)
@@ -225,11 +225,12 @@ __device__ void add_hessian(const Support& support, const Weights<S::Order, T, S
 
 constexpr int kGatherThreads = 128;
 
-// Thread blocks to fit in a multiprocessor at once, which limits registers: measured for float and quadratic weights.
+// Number of thread blocks that should fit in a multiprocessor at once, which limits registers: measured for float and
+// quadratic weights.
 template <class Task>
 constexpr int kResident = Task::Order == 2 && sizeof(typename Task::T) == 4 ? Task::resident : 2;
 
-// What the threads of whole warps have counted of where their particles go; `lost` are bits of Drift::Loss.
+// Counts of particle places by the threads of whole warps; `lost` are bits of Drift::Loss.
 __device__ inline void add_to_drift(Drift* drift, int strays, int lost) {
   const int all = __reduce_add_sync(~0u, strays);
   if (all > 0 && threadIdx.x % 32 == 0) atomicAdd(&drift->strays, all);
@@ -240,10 +241,10 @@ __device__ inline void add_to_drift(Drift* drift, int strays, int lost) {
 template <int Order, class T, int D>
 class Follower {
  public:
-  // To x from a base block whose neighbours are active where `active` has bits.
+  // Move to x from a base block whose active neighbours are the bits of `active`.
   __device__ void follow(const Topology<T, D>& t, const BaseBlock<T, D>& home, unsigned active, const Vector<T, D>& x) {
     bool inside = true;
-    unsigned touched = 1;  // as touched_blocks()
+    unsigned touched = 1;  // same order as touched_blocks()
 #pragma unroll
     for (int i = D - 1; i >= 0; i--) {
       const T node = base_node<Order>(t.geometry, i, x[i]);
@@ -258,7 +259,7 @@ class Follower {
 
   __device__ void tell(Drift* drift) const { add_to_drift(drift, strays_, lost_ ? Drift::kLost : 0); }
 
-  // Bits of the neighbours of a slot that are active.
+  // Bits of the active neighbours of a slot.
   __device__ static unsigned active_blocks(const Topology<T, D>& t, int slot) {
     const int4* const neighbours = reinterpret_cast<const int4*>(schedule_of(t).neighbours + (slot << D));
     unsigned active = 0;
@@ -284,13 +285,13 @@ class Follower {
   bool lost_ = false;
 };
 
-// Task: topology, nodes, position; load(p, scene), what it needs of a particle; compute(loaded, weights, support), what
-// the particle gets; write(p, loaded, result), with a result of zeros where positions are not those of the activation;
-// leave_out(p) for a particle outside. Where it drifts, particles may be in other active blocks than those of the
-// activation, write(...) returns where they go, and there is a drift to add that to. Where it has `Others`, that many
-// channels of the nodes `others` have a support of their own, the last argument of compute(...). Where it tells whether
-// it is due, particles are in the order of items, but for one activation. Where it may load ahead, it tells whether the
-// kernel before writes nodes alone.
+// Task: topology, nodes, position; load(p, scene), inputs of a particle; compute(loaded, weights, support), its result;
+// write(p, loaded, result), with a result of zeros where positions are not those of the activation; leave_out(p) for a
+// particle outside. With drift, particles may be in active blocks other than those of the activation, write(...)
+// returns their new place, and there is a drift to add it to. With `Others`, that many channels of the nodes `others`
+// have a separate support, the last argument of compute(...). If it has a test whether an activation is due, particles
+// are in the order of items, except for one activation. If it may load ahead, it states whether the previous kernel
+// writes only nodes.
 template <class Task>
 constexpr bool may_drift = requires { requires Task::drifts; };
 template <class Task>
@@ -387,7 +388,7 @@ __device__ void load_tile(const NodeField<const T>& nodes, const int* slots, Nod
   }
 }
 
-// The strays of an item, which wait for its other particles.
+// Strays of an item, processed after its other particles.
 template <bool Quads, class Task, int Most>
 __device__ void gather_strays(const Task& task, const Schedule<const int>& schedule, const Strays<Most>& strays,
                               int begin, const BaseBlock<typename Task::T, Task::D>& home, unsigned active,
@@ -424,12 +425,12 @@ __device__ void gather_by_items(const Task& task, const Schedule<const int>& sch
   for (int i = blockIdx.x; i < items; i += gridDim.x) {
     const int4 item = reinterpret_cast<const int4*>(schedule.items)[i];
     const int begin = item.y, end = item.z, base_block = item.w, scene = scene_of(t, base_block);
-    // Positions are loaded one round ahead and the particles' indices two, so that loads overlap.
+    // Positions are loaded one round ahead and the indices of particles two, so that loads overlap.
     int k = begin + threadIdx.x;
     const auto particle_at = [&](int k) { return t.index[k < end ? k : begin]; };
     int p = particle_at(k), p_next = particle_at(k + kGatherThreads);
     Vector<T, D> x = read_vector(task.position, p);
-    __syncthreads();  // the tile before is done
+    __syncthreads();  // the previous tile is done
     if (threadIdx.x < 1 << D) slots[threadIdx.x] = schedule.neighbours[(item.x << D) + threadIdx.x];
     if (may_drift<Task> && threadIdx.x == 32) home.template set<Task::Order>(t, base_block);
     if (may_drift<Task> && threadIdx.x == 64) strays.count = 0;

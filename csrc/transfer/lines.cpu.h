@@ -2,8 +2,8 @@
 
 #include "transfer/gather.cpu.h"
 
-// G2P of quadratic splines by polynomials along the last axis, where that takes more than half of the work. Of nodes
-// g₀, g₁, g₂ and a particle at distance z from the second one, in cells, with
+// G2P of quadratic splines by polynomials along the last axis, which takes more than half of the work otherwise. For
+// nodes g₀, g₁, g₂ and a particle at distance z from the second one, in cells, with
 //   c = (g₀ − 2 g₁ + g₂) / 8,   b = (g₂ − g₀) / 8,   a = g₁ + c:
 //   Σ N g = a + 4z (b + c z),   Σ N g r = b + c z (3 − 4z²),   Σ g ∂N = 4 (b + 2 c z).
 // All particles of a cell share a, b and c.
@@ -40,7 +40,7 @@ struct Lines {
   }
 };
 
-// What multiplies b and c in these sums.
+// Factors of b and c in these sums.
 template <class P>
 struct LastAxis {
   P z, four_z, moment, two_z;
@@ -49,7 +49,7 @@ struct LastAxis {
       : z(f - P(1)), four_z(P(4) * z), moment(z * (P(3) - four_z * z)), two_z(P(2) * z) {}
 };
 
-// Of one channel; the moments are about the second nodes, but that of the last axis about the particle.
+// For one channel; the moments are about the second nodes, except that of the last axis, which is about the particle.
 template <int Axis, bool Gradient, class T, int D>
 MPM_HD Sums<Lanes<T>, D - Axis> sum_lines(const Weights<2, Lanes<T>, D>& s, const LastAxis<Lanes<T>>& last,
                                           const T* lines) {
@@ -68,7 +68,7 @@ MPM_HD Sums<Lanes<T>, D - Axis> sum_lines(const Weights<2, Lanes<T>, D>& s, cons
   }
 }
 
-// As gather_channels, of D channels.
+// As gather_channels, for D channels.
 template <bool Gradient, class T, int D>
 MPM_HD void gather_lines(const Lanes<T> f[D], const T* lines, Sums<Lanes<T>, D> sums[D]) {
   using P = Lanes<T>;

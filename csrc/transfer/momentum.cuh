@@ -6,7 +6,7 @@
 
 namespace mpm::cuda {
 
-// The particle fields of P2G on the device.
+// Particle fields of P2G on the device.
 template <int Order, class T, int D>
 struct MomentumFields {
   Columns<const T, 1> mass, volume;
@@ -42,7 +42,7 @@ struct MomentumFields {
     }
     return m;
   }
-  // But for its motion and the stress, which the caller has.
+  // Except for its motion and the stress, which the caller has.
   __device__ ParticleMomentum<T, D> read_at_rest(int p, const T& dt) const {
     ParticleMomentum<T, D> m{};
     m.mass = mass.at(p);
@@ -70,7 +70,7 @@ struct MomentumFields {
   }
 };
 
-// Whether the stress stands apart from the affine momentum, as a multiple of the weight gradient.
+// Whether the stress is separate from the affine momentum, as a multiple of the weight gradient.
 template <class T, int D>
 bool has_gradient(const P2GArguments<T, D>& a) {
   return a.stress.pointer && a.form == StressForm::gradient;

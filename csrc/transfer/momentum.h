@@ -3,11 +3,11 @@
 #include "common/bspline.h"
 #include "common/matrix.h"
 
-// What one particle gives to its nodes in P2G, and the chain rule from the adjoint sums over those nodes.
+// Contribution of one particle to its nodes in P2G, and the chain rule from the adjoint sums over those nodes.
 //   mass:      m_i    = Σ_p N_i m_p
 //   momentum:  (mv)_i = Σ_p N_i (m_p v_p + Q_p (x_i − x_p)) + G_p ∇N_i
-// APIC (Jiang et al. 2015) has Q = m C; MLS-MPM (Hu et al. 2018, eq. 18) folds the stress into it, Q = m C − dt V D⁻¹
-// τ; the B-spline-gradient form keeps it apart, G = −dt V τ (Kirchhoff stress τ, rest volume V).
+// APIC (Jiang et al. 2015) has Q = m C; MLS-MPM (Hu et al. 2018, eq. 18) includes the stress, Q = m C − dt V D⁻¹ τ; the
+// B-spline-gradient form separates it, G = −dt V τ (Kirchhoff stress τ, rest volume V).
 namespace mpm {
 
 enum class StressForm : int { mls = 0, gradient = 1 };
@@ -25,7 +25,7 @@ struct ParticleMomentum {
   T dt;
 };
 
-// The same in node form; distances and gradients are in cells, so Q carries a factor dx and G a factor 1/dx.
+// The same in node form; distances and gradients are in cells, so Q includes a factor dx and G a factor 1/dx.
 template <class T, int D>
 struct NodeMomentum {
   T mass;
@@ -58,8 +58,8 @@ MPM_HD NodeMomentum<T, D> to_nodes(const ParticleMomentum<T, D>& p, StressForm f
   return n;
 }
 
-// From the adjoint sums S (the gathers of the node gradient that match each field of NodeMomentum) to the adjoints of
-// the particle's inputs.
+// From the adjoint sums S (the gathers of the node gradient for each field of NodeMomentum) to the adjoints of the
+// particle's inputs.
 template <int Order, class T, int D>
 MPM_HD ParticleMomentum<T, D> adjoint(const ParticleMomentum<T, D>& p, const NodeMomentum<T, D>& s, StressForm form,
                                       bool has_affine, bool has_stress, const T& dx, const T& inverse_dx) {

@@ -4,19 +4,18 @@
 #include "transfer/gather.cpu.h"
 #include "transfer/scatter.cpu.h"
 
-// Transfers of one particle, wherever it is, between its own fields and the nodes of the pool.
+// Transfers of one particle, in any block, between its own fields and the nodes of the pool.
 namespace mpm::cpu {
 inline namespace TORCH_MPM_ISA {
 
-// The rows of the pool where the nodes of one particle are, wherever it is; line l has those that differ in the last
-// axis.
+// Rows of the pool with the nodes of one particle, in any block; line l has those that differ in the last axis.
 template <int Order, class T, int D>
 struct NodesOf {
   static constexpr int S = Order + 1, kLines = D == 3 ? S * S : S;
   int64_t row[kLines][S];
 
   NodesOf(const Topology<T, D>& t, int scene, const int base[D]) {
-    int block[D][S], inside[D][S];  // what nodes of an axis add to indices of the table and of a block
+    int block[D][S], inside[D][S];  // index increments of nodes along an axis, in the table and in a block
     for (int a = D - 1, blocks = 1, nodes = 1; a >= 0; blocks *= t.geometry.blocks[a--], nodes *= kBlockWidth)
       for (int k = 0; k < S; k++) {
         block[a][k] = (base[a] + k) / kBlockWidth * blocks;
@@ -33,7 +32,7 @@ struct NodesOf {
   }
 };
 
-// The channels of one node side by side.
+// Channels of one node side by side.
 template <class T>
 using Node = Pack<T, kChannels>;
 
@@ -52,7 +51,7 @@ MPM_HD void add_to_node(NodeRow<T, D>& row, const Node<T>& sum) {
   for (int i = 0; i < D; i++) row.value[i] += sum[1 + i];
 }
 
-// As sum_nodes, of one particle, all channels at once.
+// As sum_nodes, for one particle, all channels at once.
 template <int Order, int Axis, bool Gradient, class T, int D>
 MPM_HD Sums<Node<T>, D - Axis> sum_own_nodes(const Weights<Order, Node<T>, D>& s, const NodeRow<T, D>* rows,
                                              const NodesOf<Order, T, D>& nodes, int line = 0) {
@@ -67,7 +66,7 @@ MPM_HD Sums<Node<T>, D - Axis> sum_own_nodes(const Weights<Order, Node<T>, D>& s
   });
 }
 
-// The same as gather_channels gives, about the particle.
+// Result of gather_channels, about the particle.
 template <int Order, bool Gradient, class T, int D>
 MPM_HD Sums<Node<T>, D> gather_own_nodes(const T f[D], const NodeRow<T, D>* rows, const NodesOf<Order, T, D>& nodes) {
   Node<T> distance[D];
@@ -80,7 +79,7 @@ MPM_HD Sums<Node<T>, D> gather_own_nodes(const T f[D], const NodeRow<T, D>* rows
   return sums;
 }
 
-// As sum_cell, of particle p.
+// As sum_cell, for particle p.
 template <int Order, bool Gradient, class T, int D>
 MPM_HD void add_to_own_nodes(const Contributions<Order, T, D, true, Gradient>& g, int p, NodeRow<T, D>* rows,
                              const NodesOf<Order, T, D>& nodes) {

@@ -1,10 +1,10 @@
 #include "transfer/gather.cpu.h"
 
-// The adjoint of P2G.
+// Adjoint of P2G.
 namespace mpm::cpu {
 inline namespace TORCH_MPM_ISA {
 
-// Those of x, mass and volume.
+// Adjoints of x, mass and volume.
 constexpr bool is_sum(int field) { return field == 0 || field == 1 || field == 5; }
 
 template <class P, int D, class Store>

@@ -1,10 +1,10 @@
 #include "transfer/gather.cpu.h"
 
-// The position gradient of scatter and gather.
+// Position gradient of scatter and gather.
 namespace mpm::cpu {
 inline namespace TORCH_MPM_ISA {
 
-// Adds to the position gradient what channels first, ..., first + count - 1 contribute.
+// Adds the contribution of channels first, ..., first + count - 1 to the position gradient.
 template <int Order, bool Slope, bool Gradient, class T, int D>
 void position_gradient_with(const PositionGradientArguments<T, D>& a, int first, int count) {
   using P = Lanes<T>;

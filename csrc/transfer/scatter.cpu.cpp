@@ -9,7 +9,7 @@ void p2g_with(const P2GArguments<T, D>& a) {
   scatter_channels<Order, Slope, Gradient>(
       a.topology, a.x, a.nodes, 0, 1 + D,
       [&]<int N>(const GroupOf<N>& g, const Pack<T, N> f[D], int scene) __attribute__((always_inline)) {
-        // One contribution for both, so that rounding does not depend on what is consecutive.
+        // One contribution for both, so that rounding does not depend on contiguity.
         const bool run = direct && g.consecutive;
         const auto p = run ? load_momentum(a, RunOf<N>{g.id[0]}, scene) : load_momentum(a, g, scene);
         return momentum_contribution<Order, Slope, Gradient>(a.topology.geometry, p, f);

@@ -6,11 +6,11 @@
 #include "transfer/contribution.cpu.h"
 
 // Particles to nodes, for up to kChannels channels. The particles of a cell share their nodes, so that their
-// contributions are summed in registers before they go to the tile of the base block.
+// contributions are summed in registers before they are added to the tile of the base block.
 namespace mpm::cpu {
 inline namespace TORCH_MPM_ISA {
 
-// The particles of a chunk, ready to be summed.
+// Particles of a chunk, ready to be summed.
 template <int Order, class T, int D, bool Slope, bool Gradient>
 struct Contributions {
   static constexpr int S = Order + 1;
@@ -20,7 +20,7 @@ struct Contributions {
   static constexpr int kLine = kChunk + 16;  // not a power of two, so that the arrays do not share cache sets
   static constexpr int kPlanes = D == 3 ? S : 1, kSlopeLine = Gradient ? kLine : 1;
   alignas(64) T row[kChunk][kPadded];  // value about the second node, slopes, gradients
-  // Of the lines of nodes along the last axis: products of the other axes, and with one derivative.
+  // For the lines of nodes along the last axis: products of the other axes, and with one derivative.
   alignas(64) T line[kPlanes][S][kLine];
   alignas(64) T slope_x[kPlanes][S][D == 3 ? kSlopeLine : 1], slope_y[kPlanes][S][kSlopeLine];
   alignas(64) T weight[S][kLine], slope[S][kSlopeLine];  // of the last axis
@@ -101,13 +101,13 @@ MPM_HD FourNodes<T> spread(const T* value, int stride) {
   return r;
 }
 
-// At node k of an axis, from the value at the second one.
+// At node k of an axis, given the value at the second one.
 template <class P>
 MPM_HD P at_node(int k, const P& value, const P& slope) {
   return k == 0 ? value - slope : k == 1 ? value : k == 2 ? value + slope : value + P(k - 1) * slope;
 }
 
-// Sums the particles order[0 .. count) of one cell into the tile at its base node.
+// Adds the particles order[0 .. count) of one cell to the tile at its base node.
 template <int Order, class T, int D, bool Slope, bool Gradient>
 void sum_cell(const Contributions<Order, T, D, Slope, Gradient>& g, const uint16_t* order, int count, T* tile) {
   using Row = FourNodes<T>;
@@ -148,7 +148,7 @@ void sum_cell(const Contributions<Order, T, D, Slope, Gradient>& g, const uint16
     for (int j = 0; j < S; j++) sum[i][j].store(tile + i * kTileX + j * kTileY);
 }
 
-// Numbers of N cells as a Schedule holds them.
+// Numbers of N cells in the form of a Schedule.
 template <int N>
 struct EntriesOf {
   typedef uint16_t Value __attribute__((vector_size(N * sizeof(uint16_t))));
@@ -164,7 +164,7 @@ MPM_HD typename EntriesOf<N>::Value entries_of(const uint16_t* order, int count)
   return entry;
 }
 
-// Distance of the particles of a group, whose cells are given, from their base nodes.
+// Distances of the particles of a group, with given cells, from their base nodes.
 template <class T, int D, int N>
 MPM_HD void distances(const Topology<T, D>& t, const BaseBlock<T, D>& base_block,
                       const typename EntriesOf<N>::Value& entry, const Pack<T, N> x[D], Pack<T, N> f[D]) {
@@ -180,14 +180,14 @@ MPM_HD void distances(const Topology<T, D>& t, const BaseBlock<T, D>& base_block
   }
 }
 
-// Cells in an order in which neighbours along the last axis, whose rows overlap shifted, do not follow each other: a
-// load must not wait for a store that covers it in part.
+// Cells in an order in which neighbours along the last axis, whose rows overlap shifted, are not consecutive: a load
+// must not wait for a store that covers it in part.
 template <int D>
 MPM_HD int nth_cell(int n) {
   return n % (kBlockNodes<D> / kBlockWidth) * kBlockWidth + n / (kBlockNodes<D> / kBlockWidth);
 }
 
-// Sums the particles of a chunk, with the order that a Schedule has, cell by cell.
+// Sums the particles of a chunk, in the order of a Schedule, cell by cell.
 template <int Order, class T, int D, bool Slope, bool Gradient>
 void sum_cells(const Contributions<Order, T, D, Slope, Gradient>& contributions, const uint16_t* order,
                const uint16_t* cell_end, Tile<Order, T, D>& tile) {
@@ -200,8 +200,8 @@ void sum_cells(const Contributions<Order, T, D, Slope, Gradient>& contributions,
   }
 }
 
-// Adds channels first, ..., first + count - 1, chunk by chunk. begin() gives each thread a function of (base block,
-// chunk, contributions, tile), which adds a chunk to the tile.
+// Adds channels first, ..., first + count - 1, chunk by chunk. begin() returns for each thread a function of (base
+// block, chunk, contributions, tile), which adds a chunk to the tile.
 template <int Order, bool Slope, bool Gradient, class T, int D, class F>
 void scatter_chunks(const Topology<T, D>& t, const NodeField<T>& nodes, int first, int count, const F& begin) {
   const ScheduleIn s = schedule_of(t);
@@ -223,7 +223,7 @@ void scatter_chunks(const Topology<T, D>& t, const NodeField<T>& nodes, int firs
   });
 }
 
-// The same where give(group, f, scene) makes the contributions of a group.
+// The same where give(group, f, scene) returns the contributions of a group.
 template <int Order, bool Slope, bool Gradient, class T, int D, class F>
 void scatter_channels(const Topology<T, D>& t, const Field<const T>& x, const NodeField<T>& nodes, int first, int count,
                       const F& give) {

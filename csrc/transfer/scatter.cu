@@ -13,7 +13,7 @@ struct FieldSource {
   Columns<const T, D> position;
   Columns<const T, K> value;
   Columns<const T, K * D> moment, gradient;
-  T moment_scale, gradient_scale;  // to cells
+  T moment_scale, gradient_scale;  // converts to cells
 
   FieldSource(const ScatterArguments<T, D>& a, int first)
       : topology(a.topology),

@@ -5,16 +5,16 @@
 #include "cuda/quad.cuh"
 #include "transfer/momentum.cuh"
 
-// The kernel of P2G and scatter. One thread block takes the particles of one item, links them by cell in shared memory,
-// and adds up nodes in registers: each cell has one thread per leading node of the support, Order + 1 of them, which
-// walks the particles of the cell and adds to the slab of nodes behind that leading node. Each node of the tile around
-// the block then sums the slabs that reach it, and adds that to the grid: one vector reduction per node, however many
-// particles there are.
+// The kernel of P2G and scatter. One thread block processes the particles of one item, links them by cell in shared
+// memory, and sums nodes in registers: each cell has one thread per leading node of the support, Order + 1 of them,
+// which walks the particles of the cell and adds to the slab of nodes behind that leading node. Each node of the tile
+// around the block then sums the slabs that reach it, and adds the result to the grid: one vector reduction per node,
+// for any number of particles.
 //
-// A node gets N_i (a + B · i) + G · ∇N_i from a particle, i being the distance from the base node in cells: `Linear`
-// channels of this kind after `Plain` ones with B = G = 0. In deterministic mode particles are linked in the order of
-// the index tensor, and what an item gives is added in fixed point, or block by block: those of one colour at a time,
-// no two of which share a node.
+// The contribution of a particle to a node is N_i (a + B · i) + G · ∇N_i, i being the distance from the base node in
+// cells: `Linear` channels of this kind after `Plain` ones with B = G = 0. In deterministic mode particles are linked
+// in the order of the index tensor, and the result of an item is added in fixed point, or block by block: blocks of one
+// colour at a time, no two of which share a node.
 namespace mpm::cuda {
 
 template <class T>
@@ -45,32 +45,32 @@ struct ScatterShape {
   static constexpr int slices = Slices;
   static constexpr int lists = cells * slices, threads = lists * support;
 
-  // A particle in shared memory: its distance from the base node along the first axis, the weights along the others but
-  // for one, since they add up to one, and what it gives. In quads, and a pair where that leaves one or two words.
+  // Particle in shared memory: its distance from the base node along the first axis, the weights along the others
+  // except one, since they add up to one, and its contribution. In quads, and a pair where one or two words remain.
   static constexpr int derivatives = Gradient ? 2 : 1, stored = support - 1;
   static constexpr int weights = 1, plain = weights + (D - 1) * derivatives * stored, linear = plain + Plain;
   static constexpr int linear_words = 1 + D * derivatives, words = linear + Linear * linear_words;
   static constexpr int pairs = words % 4 == 1 || words % 4 == 2, quads = (words + 3) / 4 - pairs;
-  using Link = uint16_t;  // the number of a row
+  using Link = uint16_t;  // number of a row
   static constexpr int row_bytes = (quads * 4 + pairs * 2) * int(sizeof(T)) + int(sizeof(Link));
   static constexpr int fitting = 90 * 1024 / row_bytes / 32 * 32;
   static constexpr int batch = fitting < kItemParticles ? fitting : kItemParticles;
 
-  // The sums, in the same memory: the slab of each thread. The four nodes of a block along the last axis are contiguous
-  // in the grid, so rows of the tile are, too, and are handled four words at a time.
+  // Sums, in the same memory: the slab of each thread. The four nodes of a block along the last axis are contiguous in
+  // the grid, so rows of the tile are too, and are processed four words at a time.
   static constexpr int near_quads = channels, far_quads = (Order * channels + 3) / 4;
   static constexpr int row_quads = near_quads + far_quads;
 
   static constexpr size_t particle_bytes = size_t(batch) * row_bytes;
-  // In two rounds, each of a half of every slab, where they would take more than most devices have.
+  // In two rounds, each of a half of every slab, where they would exceed the memory of most devices.
   static constexpr int rounds = size_t(threads) * slab * channels * sizeof(T) > 90 * 1024 ? 2 : 1, part = slab / rounds;
   static_assert(slab % rounds == 0);
   static constexpr size_t sum_bytes = size_t(threads) * part * channels * sizeof(T);
   static constexpr size_t shared_bytes = particle_bytes > sum_bytes ? particle_bytes : sum_bytes;
 };
 
-// The particles of a batch in shared memory, in linked lists of rows: one for each cell, or for each slice of it, and
-// one of particles that are not in their base block.
+// Particles of a batch in shared memory, in linked lists of rows: one for each cell, or for each slice of it, and one
+// of particles outside their base block.
 template <class S>
 struct SharedParticles {
   using T = typename S::T;
@@ -80,7 +80,7 @@ struct SharedParticles {
   Pair<T>* pairs;  // [pairs, batch]
   Link* next;      // [batch]
   int* head;       // [lists + 1]
-  int room;        // where S::batch is 0, in its place
+  int room;        // where S::batch is 0, instead of it
 
   __device__ SharedParticles(char* memory, int* head, int room = S::batch) : head(head), room(room) {
     quads = reinterpret_cast<Quad<T>*>(memory);
@@ -92,7 +92,7 @@ struct SharedParticles {
   __device__ static int row(int k) { return k ^ (k / 8 & 7); }
 };
 
-// The weights of an axis without those of node 1, which follow from the others.
+// Weights of an axis without those of node 1, which follow from the others.
 template <class S, class T>
 __device__ void pack_weights(const T& f, T* packed) {
   T w[S::support];
@@ -117,7 +117,7 @@ __device__ void unpack_weights(const T* packed, const T& sum, T* w) {
   }
 }
 
-// Of a row, with those that quads and a pair may have in excess.
+// Words of a row, including excess words of quads and a pair.
 template <class S>
 constexpr int kWords = S::quads * 4 + 2;
 
@@ -162,7 +162,7 @@ __device__ void store_particle(const SharedParticles<S>& shared, int row, const 
   if (S::pairs > 0) shared.pairs[row] = {word[4 * S::quads], word[4 * S::quads + 1]};
 }
 
-// One thread of a cell: which list it walks, and which of the leading nodes it adds to.
+// One thread of a cell: the list that it walks, and the leading node that it adds to.
 template <class S>
 struct Walker {
   using T = typename S::T;
@@ -173,7 +173,7 @@ struct Walker {
   __device__ explicit Walker(int number) : list(number / S::support), lane(number % S::support), leading(lane) {}
 };
 
-// A row of nodes along the last axis gets w_k (at + k step) + w'_k along.
+// A row of nodes along the last axis receives w_k (at + k step) + w'_k along.
 template <class S, class T>
 __device__ void add_row(const T (*w)[S::support], T at, const T& step, const T& along, int channel,
                         T (*sum)[S::channels]) {
@@ -185,7 +185,7 @@ __device__ void add_row(const T (*w)[S::support], T at, const T& step, const T& 
   }
 }
 
-// What one thread adds to its slab from one particle; rows of nodes along the last axis are Pitch nodes apart.
+// Contribution of one particle to the slab of a thread; rows of nodes along the last axis are Pitch nodes apart.
 template <class S, int Pitch = S::support, class T>
 __device__ void add_particle(const SharedParticles<S>& shared, const Walker<S>& walker, int row,
                              T (*sum)[S::channels]) {
@@ -255,7 +255,7 @@ __device__ void empty_lists(int* head) {
   for (int c = threadIdx.x; c <= S::lists; c += S::threads) head[c] = SharedParticles<S>::end;
 }
 
-// Of particle k of a batch.
+// For particle k of a batch.
 template <class S>
 __device__ int list_of(int k, bool in_block, int cell) {
   return in_block ? k % S::slices * S::cells + cell : S::lists;
@@ -265,7 +265,7 @@ struct NoCells {
   static constexpr int cells = 0;
 };
 
-// Particles in the order of their cells: where those of each cell begin.
+// Particles in the order of their cells: first index of each cell.
 template <class S>
 struct CellOrder {
   int start[S::cells + 1];
@@ -289,8 +289,8 @@ __device__ void number_in_order(const SharedParticles<S>& shared, CellOrder<S>& 
   }
 }
 
-// Finds the places of the particles index[begin, begin + n) in the order of their cells. Each thread leaves for its own
-// the number in `next`, counted in its cell, and the index in `pairs`, since places take the place of index.
+// Finds the places of the particles index[begin, begin + n) in the order of their cells. Each thread stores for its own
+// particle the number in `next`, counted in its cell, and the index in `pairs`, since places overwrite the index.
 template <class S, class Source, class T, int D>
 __device__ void order_by_cell(const Source& source, const Topology<T, D>& t, const BaseBlock<T, D>& base_block,
                               const SharedParticles<S>& shared, CellOrder<S>& order, int begin, int n, bool in_order) {
@@ -362,7 +362,7 @@ __device__ void load_particles(const Source& source, const Topology<T, D>& t, in
       following = t.index[begin + k + S::threads];
     int cell;
     T f[D];
-    // Loaded and stored wherever the particle is, so that no load waits for another.
+    // Loaded and stored for any place of the particle, so that no load waits for another.
     const Vector<T, D> x = read_vector(source.position, p);
     const bool in_block = base_block.template locate<S::Order>(t.geometry, x, cell, f);
     const auto loaded = [&] {
@@ -383,7 +383,7 @@ __device__ void load_particles(const Source& source, const Topology<T, D>& t, in
   }
 }
 
-// The nodes that P2G adds to, and whether in fixed point.
+// Destination nodes of P2G, and whether in fixed point.
 template <class T>
 struct NodeSums : NodeField<T> {
   FixedPoint fixed;
@@ -398,7 +398,7 @@ __device__ bool is_fixed(const NodeSums<T>& nodes) {
   return sizeof(T) == sizeof(float) && nodes.fixed.largest_mass;
 }
 
-// Adds to words of rows of nodes in fixed point, from one of a row on.
+// Adds to words of rows of nodes in fixed point, from one word of a row on.
 template <class S, int N, class T>
 __device__ void add_fixed_words(const NodeField<T>&, int64_t, int, const T (&)[N]) {}
 template <class S, int N>
@@ -448,7 +448,7 @@ __device__ T pick(const T (&of)[N], int k) {
   return r;
 }
 
-// What the node at `offset` from the base node gets from a particle in shared memory.
+// Contribution of a particle in shared memory to the node at `offset` from the base node.
 template <class S, class T>
 __device__ void node_value(const SharedParticles<S>& shared, int row, const int (&offset)[S::D],
                            T (&value)[S::channels]) {
@@ -492,8 +492,8 @@ __device__ void node_value(const SharedParticles<S>& shared, int row, const int 
   }
 }
 
-// The nodes of the support of one particle, by a warp, a lane to a node: node_row(offset) is the row of the node, -1 of
-// a block that is not active.
+// Nodes of the support of one particle, by a warp, one lane per node: node_row(offset) is the row of the node, -1 in an
+// inactive block.
 template <class S, class Nodes, class NodeRow>
 __device__ void add_stray(const Nodes& nodes, const SharedParticles<S>& shared, int row, const NodeRow& node_row) {
   using T = typename S::T;
@@ -522,7 +522,7 @@ __device__ void add_stray(const Nodes& nodes, const SharedParticles<S>& shared, 
   }
 }
 
-// The same of a particle whose base node is in the row `first`.
+// The same for a particle whose base node is in the row `first`.
 template <class S, class Nodes>
 __device__ void add_stray(const Nodes& nodes, const Schedule<const int>& schedule, const SharedParticles<S>& shared,
                           int row, int first) {
@@ -540,8 +540,8 @@ __device__ void add_stray(const Nodes& nodes, const Schedule<const int>& schedul
   });
 }
 
-// The strays of a batch index[begin, ...) go to the nodes without a tile. Each lane finds one, so that its loads do not
-// wait for those of others, and then the warp takes them in turn.
+// Strays of a batch index[begin, ...) are added to the nodes without a tile. Each lane finds one, so that its loads do
+// not wait for those of others, and then the warp processes them in turn.
 template <class S, class Source, class Nodes, int Most, class T, int D>
 __device__ void add_strays(const Source& source, const Nodes& nodes, const Topology<T, D>& t,
                            const Schedule<const int>& schedule, int scene, const SharedParticles<S>& shared,
@@ -566,7 +566,7 @@ __device__ void add_strays(const Source& source, const Nodes& nodes, const Topol
   }
 }
 
-// The part of the slab of a thread that the round is of, in the place that only this thread has.
+// Part of the slab of a thread in this round, at the place of this thread.
 template <class S, int Round, class T>
 __device__ void put_slab(const T (&sum)[S::slab][S::channels], T* sums) {
   T* const to = sums + threadIdx.x * (S::part * S::channels);
@@ -582,7 +582,7 @@ __device__ void put_slab(const T (&sum)[S::slab][S::channels], T* sums) {
   }
 }
 
-// f(place, reaches) of the slabs that may reach a node of the tile: where the node is in them, if it is.
+// f(place, reaches) for the slabs that may reach a node of the tile: index of the node in them, if it is there.
 template <class S, int Round, class F>
 __device__ void each_slab(const int (&node)[S::D], const F& f) {
   constexpr int D = S::D, count = D == 2 ? S::support * S::support : S::support * S::slab;
@@ -614,8 +614,8 @@ __device__ T word_sum(const T* sums, int (&node)[S::D], int word) {
   return sum;
 }
 
-// Four words of a row of the tile, from one on; where these are not those of a node, a lane has each of them, and the
-// first one all.
+// Four words of a row of the tile, from one on; where these are not the words of a node, each lane has one of them, and
+// the first lane all.
 template <class S, int Round, class T>
 __device__ Quad<T> quad_sum(const T* sums, int (&node)[S::D], int first_word, bool exists) {
   Quad<T> sum{};
@@ -636,7 +636,7 @@ __device__ Quad<T> quad_sum(const T* sums, int (&node)[S::D], int first_word, bo
   return sum;
 }
 
-// Adds what nodes get in a round to the grid, four words at a time.
+// Adds the sums of nodes of a round to the grid, four words at a time.
 template <class S, int Round, int D, class Nodes, class T>
 __device__ void flush_tile(const Nodes& nodes, const int slots[1 << D], const T* sums, bool in_order) {
   constexpr int K = S::channels, width = S::width, lanes = K == 4 ? 1 : 4;
@@ -670,8 +670,8 @@ __device__ void flush_tile(const Nodes& nodes, const int slots[1 << D], const T*
   }
 }
 
-// Adds the particles in shared memory to the nodes, and lets `strays` add those that are in no list; `when_added` is
-// called when none of them is needed any more. All threads have to wait before that memory is used again.
+// Adds the particles in shared memory to the nodes, and lets `strays` add those in no list; `when_added` is called when
+// none of them is needed any more. All threads have to wait before that memory is reused.
 template <class S, class Nodes, class AddStrays, class WhenAdded>
 __device__ void add_particles(const Nodes& nodes, const SharedParticles<S>& shared, const int* slots, bool in_order,
                               const AddStrays& add_strays, const WhenAdded& when_added) {
@@ -705,8 +705,7 @@ __device__ void add_particles(const Nodes& nodes, const SharedParticles<S>& shar
   add_particles(nodes, shared, slots, in_order, add_strays, [] {});
 }
 
-// What the thread blocks of P2G have in shared memory beside the particles and the sums, which follow one another
-// there.
+// Shared memory of the thread blocks of P2G beside the particles and the sums, which follow one another there.
 template <class S, bool Drifts>
 struct ScatterMemory {
   int slots[1 << S::D], head[S::lists + 1];
@@ -737,8 +736,8 @@ __device__ void scatter_item(const Source& source, const Topology<typename Sourc
 }
 
 // Source: topology, nodes, position; whether particles may have drifted; load(p, scene), or load(p, scene, place) with
-// its place in the index, what it needs of a particle; contribution(loaded), what the particle gives; and perhaps
-// is_due(), whether there is anything to do, and leave_out(p, place) for a particle outside.
+// its place in the index, the inputs of a particle; contribution(loaded), its contribution; and optionally is_due(),
+// whether there is work, and leave_out(p, place) for a particle outside.
 //
 // colour < 0: every item, with atomics. Otherwise the base blocks of that colour, whole, without atomics.
 template <class Source>
@@ -757,7 +756,7 @@ __global__ void __launch_bounds__(Source::Shape::threads, Source::resident)
   const bool in_order = colour >= 0;
   const int4* const items = reinterpret_cast<const int4*>(schedule.items);
   const int count = *schedule.item_count;
-  int4 entries = items[blockIdx.x];  // without waiting for the count: there is room for as many
+  int4 entries = items[blockIdx.x];  // without waiting for the count: the space suffices
   for (int i = blockIdx.x; i < count;) {
     Item item{entries.x, entries.y, entries.z, entries.w};
     i += gridDim.x;
@@ -788,7 +787,7 @@ void launch_scatter(const Source& source, bool deterministic, Stream stream) {
 
 enum class Stress { none, moment, gradient };
 
-// Drifts: particles may be in other active blocks than they were activated in.
+// Drifts: particles may be in active blocks other than those of the activation.
 template <int Order, class T, int D, Stress Kind, bool Drifts>
 struct MomentumSource {
   static constexpr bool drifts = Drifts;

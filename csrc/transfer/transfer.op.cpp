@@ -3,7 +3,7 @@
 #include "grid/topology.op.h"
 #include "transfer/kernels.h"
 
-// P2G, G2P and the channel-wise scatter and gather below them.
+// P2G, G2P and the underlying channel-wise scatter and gather.
 namespace mpm {
 namespace {
 
