@@ -17,7 +17,6 @@ import shutil
 import signal
 import sys
 import tempfile
-import time
 import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -73,18 +72,19 @@ def run_and_signal(
     """As `run`, with a signal ``delay`` seconds after ``work`` has begun.
 
     Returns:
-        The outcome, which is "ok" if the signal itself has ended the child, and the time from the signal to the end
-        [s]: 0 for a child that has ended before.
+        The outcome, which is "ok" if the signal itself has ended the child, and the CPU time that the child has used
+        from the signal to its end [s], which does not depend on what else the machine does; 0 for a child that has
+        ended before.
     """
     with _Child(work, 4 << 30) as child:
         child.wait_for_begin()
         if child.wait(delay):
             return child.outcome(True), 0.0
+        before = child.cpu_seconds()
         os.kill(child.pid, number)
-        begin = time.monotonic()
         ended = child.wait(seconds)
-        late = time.monotonic() - begin
         outcome = child.outcome(ended)
+    late = max(child.used - before, 1e-3)
     return replace(outcome, kind="ok") if ended and outcome.status == -number else outcome, late
 
 
@@ -92,6 +92,7 @@ class _Child:
     """A child process that calls ``work`` and ends; a context manager."""
 
     def __init__(self, work: Callable[[], int], memory: int) -> None:
+        self.used = 0.0  # CPU time [s], once it has ended
         self._output = tempfile.TemporaryFile()
         self._begun, begins = os.pipe()
         for stream in (sys.stdout, sys.stderr):
@@ -117,11 +118,17 @@ class _Child:
         """Whether the child ends within some seconds."""
         return bool(select.select([self._descriptor], [], [], seconds)[0])
 
+    def cpu_seconds(self) -> float:
+        """CPU time of all its threads so far [s]."""
+        fields = Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
     def outcome(self, ended: bool, must_fail: bool = False) -> Outcome:
         """How it ended. One that has not is killed."""
         if not ended:
             os.kill(self.pid, signal.SIGKILL)
-        status = os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
+        _, status, usage = os.wait4(self.pid, 0)
+        status, self.used = os.waitstatus_to_exitcode(status), usage.ru_utime + usage.ru_stime
         self._output.seek(0)
         text = self._output.read().decode(errors="replace")
         return Outcome(_kind(ended, status, text, must_fail), status, text)

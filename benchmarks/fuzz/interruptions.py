@@ -4,8 +4,8 @@
 
 `run`, `generate`, `export` and `render` are each killed (SIGKILL) and signalled (SIGINT or SIGTERM) so many times, then
 called again. Their files must have the bytes of those of an undisturbed call, and nothing else may lie beside them.
-After a signal a command has `SOON` seconds to end with the exit status of the signal; in a part of the cases it is one
-whose frames, scenes or shards take much longer. The exit status is 1 if there is a fault.
+After a signal a command has `SOON` seconds of CPU time to end with the exit status of the signal; in a part of the
+cases it is one whose frames, scenes or shards take much longer. The exit status is 1 if there is a fault.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ from .files import SCENE, SET
 
 COLUMNS = ("crash", "traceback", "wrong exit status", "late end", "files left", "lost or changed")
 FIGURES = ("still at work", "slowest end, s")
-"""Calls that had not ended before their signal, and the longest time to the end after it."""
+"""Calls that had not ended before their signal, and the most CPU time to the end after it."""
 COMMANDS = ("run", "generate", "export", "render")
-SOON = 1.5
-"""Time that a command may take to end, on a machine with other work [s]."""
+SOON = 1.2
+"""CPU time that a command may use to end, its exit from Python included [s]."""
 MOST = 120.0
 """Time of any call [s]."""
 STATUS = {signal.SIGINT: 130, signal.SIGTERM: 143}
@@ -188,7 +188,7 @@ class Interruptions:
             found.append("files left")
             print(left, flush=True)
         if found:
-            when = f"{number.name} after {delay:.3f} s, ended {late:.2f} s later with {outcome.status}"
+            when = f"{number.name} after {delay:.3f} s, ended after {late:.2f} s of CPU time with {outcome.status}"
             print(f"{words} with {when}: {outcome.text[-2000:]}", flush=True)
         yield from found
 

@@ -3,6 +3,7 @@
 import itertools
 import threading
 import time
+import weakref
 
 import pytest
 
@@ -43,6 +44,33 @@ def test_work_is_stopped_and_what_waits_is_cancelled():
         executor.stop()
         assert isinstance(first.exception(), Stopped) and second.cancelled()
     assert not work.ended
+
+
+def test_work_is_stopped_in_a_callback_that_drops_exceptions(capfd):
+    """As torch's dictionaries of weak references have them."""
+    work, dropped = LongWork(), threading.Event()
+
+    class Target:
+        pass
+
+    def callback(_):
+        dropped.set()
+        end = time.monotonic() + LONG
+        while time.monotonic() < end:
+            pass
+
+    def in_callback():
+        target = Target()
+        reference = weakref.ref(target, callback)
+        del target
+        return work() if reference() is None else None
+
+    with StoppableExecutor() as executor:
+        future = executor.submit(in_callback)
+        dropped.wait()
+        executor.stop()
+        assert isinstance(future.exception(), Stopped) and not work.ended
+    assert "Stopped" not in capfd.readouterr().err
 
 
 def test_an_executor_without_work_is_stopped():

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import difflib
+import json
+import re
 import types
 import typing
 from collections.abc import Iterator, Sequence
@@ -16,6 +18,8 @@ MOST_LINES = 20
 """Maximum number of problems in the message of an error."""
 MOST_LETTERS = 1000
 """Maximum length of a problem in the message: values of files may be long."""
+UNWRITABLE = re.compile(r"\\u0000|[\ud800-\udfff]")
+"""Null characters and lone surrogates in a JSON text."""
 
 
 class SceneError(ValueError):
@@ -35,18 +39,25 @@ def _shortened(line: str) -> str:
     return f"{line[: MOST_LETTERS // 2]} [{len(line) - MOST_LETTERS} letters] {line[-MOST_LETTERS // 2 :]}"
 
 
-def text_problems(words: Any, path: str = "") -> Iterator[str]:
-    """One line for each text, or name of a key, that cannot be written to a file: with a null character or a lone
-    surrogate.
-    """
+def text_problems(words: Any) -> list[str]:
+    """One line for each text, or name of a key, that cannot be written: with a null character or a lone surrogate."""
+    try:
+        suspicious = UNWRITABLE.search(json.dumps(words, ensure_ascii=False, default=str))
+        unwritable = suspicious is not None
+    except (TypeError, ValueError, RecursionError):  # as for keys that are not texts, or numbers of 5000 digits
+        unwritable = True
+    return list(_unwritable(words, "")) if unwritable else []  # slower, and data sets check every batch of scenes
+
+
+def _unwritable(words: Any, path: str) -> Iterator[str]:
     if isinstance(words, dict):
         for key, value in words.items():
             place = f"{path}.{key}" if path else str(key)
-            yield from text_problems(str(key), f"{ascii(place)[1:-1]} (a key)")
-            yield from text_problems(value, place)
+            yield from _unwritable(str(key), f"{ascii(place)[1:-1]} (a key)")
+            yield from _unwritable(value, place)
     elif isinstance(words, (list, tuple)):
         for k, item in enumerate(words):
-            yield from text_problems(item, f"{path}[{k}]")
+            yield from _unwritable(item, f"{path}[{k}]")
     elif isinstance(words, str) and ("\0" in words or any("\ud800" <= letter <= "\udfff" for letter in words)):
         yield f"{path}: has letters that no file can hold, got {words!a}"
 

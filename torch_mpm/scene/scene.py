@@ -49,7 +49,7 @@ class Scene(schema.SceneData):
     _source: str = PrivateAttr(default="")
 
     def __init__(self, **words: Any) -> None:
-        if problems := list(text_problems(words)):
+        if problems := text_problems(words):
             raise SceneError(problems)
         try:
             super().__init__(**words)
