@@ -582,8 +582,11 @@ def test_what_is_wrong(device, recorded):
 @pytest.mark.filterwarnings("ignore:Anomaly Detection")
 def test_obstacles(device, recorded):
     step, state = learned(device)
-    why = captured_steps.obstacle_to_graphs
-    assert why(step, state, DT) is None
+
+    def why(step, state, dt):
+        return mpm.plan_rollout(step, state, 100, dt).reasons["graph"]
+
+    assert why(step, state, DT).startswith("rollout(graph=...)")
     assert why(lambda state, dt: state, state, DT) == "it is no module"
     assert why(step, state, torch.tensor(DT)) == "dt is a tensor"
     with torch.autograd.detect_anomaly():
@@ -599,5 +602,5 @@ def test_obstacles(device, recorded):
         assert_equal(mpm.rollout(step, state, 3, DT, graph=2), one_by_one(learned(device)[0], state, 3, DT))
     assert not recorded
     if device == "cuda":
-        assert "nor with graph=..., because there are hooks" in step.explain(state, DT)
-        assert "rollout(graph=...) replays some" in learned(device)[0].explain(state, DT)
+        assert "not graph: there are hooks" in step.explain(state, DT)
+        assert "rollout(graph=...) takes some" in learned(device)[0].explain(state, DT)

@@ -59,7 +59,7 @@ def environments(device: str, count: int = 4) -> mpm.Environments:
 def test_scenes_of_any_size_are_what_they_are_alone(device):
     """Size, throw, stiffness and gravity of their own; absent particles are not noticed, nor told of."""
     envs = environments(device)
-    assert envs.step.explain(envs.state) == "all steps in one op"
+    assert envs.step.explain(envs.state).startswith("all steps in one op")
     envs.advance(N, DT)
     for k in range(4):
         assert_equal(envs.scene(k), alone(envs.step, k, one(k, device), N), exactly=False)
@@ -143,7 +143,7 @@ def test_clocks_of_moving_obstacles(device):
     paddle = mpm.Box((0.5, 0.0), (0.2, 0.2), velocity=(0.0, 5.0), end=2.5 * N * DT)
     step = step_of(3, device, boundaries=[paddle])
     envs = mpm.Environments(step, [one(0, device)] * 3)
-    assert step.explain(envs.state.replace(time=envs.time), DT) == "all steps in one op"
+    assert step.explain(envs.state.replace(time=envs.time), DT).startswith("all steps in one op")
     envs.count_impulses()
     envs.advance(N, DT)
     envs.reset([1])

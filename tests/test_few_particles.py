@@ -9,7 +9,6 @@ from cases.small_scenes import F64, LAWS, assert_same, both, joined
 from helpers import relative_error
 
 import torch_mpm as mpm
-from torch_mpm.rollouts import takes_few_blocks
 
 N, DT = 50, 1e-3
 
@@ -57,7 +56,8 @@ def test_crowded_blocks(high, dim, device):
     step, single = make(dim, max_blocks=None), make(dim)
     with torch.no_grad():
         half, _ = both(step, single, state, 20, 5e-4)
-        assert device == "cpu" or takes_few_blocks(step, half, 30)
+        plan = mpm.plan_rollout(step, half, 30, 5e-4)
+        assert device == "cpu" or (plan.schedule, plan.max_blocks) == ("persistent", step.grid.block_count)
         end = mpm.rollout(step, half, 30, 5e-4)
     _, expected = both(make(dim), single, state, 50, 5e-4)
     step.check(end)

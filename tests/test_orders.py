@@ -8,7 +8,8 @@ from helpers import OpNames
 from torch import Tensor
 
 import torch_mpm as mpm
-from torch_mpm import orders, rollouts
+from torch_mpm import adaptive
+from torch_mpm.rollouts import fused_op, plan
 
 DT = 1e-4
 
@@ -16,9 +17,14 @@ DT = 1e-4
 @pytest.fixture(autouse=True)
 def few(monkeypatch):
     """For few particles, on every device."""
-    monkeypatch.setattr(orders, "LEAST_PARTICLES", 100)
-    monkeypatch.setattr(orders, "LEAST_STEPS", 4)
-    monkeypatch.setattr(orders, "wants_order", lambda x: True)
+    whole = plan.plan_call
+
+    def planned(schedule: str | None, facts: plan.Facts) -> plan.CallPlan:
+        unsorted = not facts.sorted and facts.particles >= 100 and facts.steps >= 4
+        return whole(schedule, facts)._replace(order=int(unsorted))
+
+    monkeypatch.setattr(plan, "plan_call", planned)
+    monkeypatch.setattr(adaptive, "plan_call", planned)
 
 
 @pytest.fixture
@@ -67,7 +73,7 @@ def test_the_order_comes_back(transfer, dtype, dim, device, sorts):
 @torch.no_grad()
 def test_particles_are_sorted_again(monkeypatch, dim, device, sorts):
     step, state = case(dim, device)
-    monkeypatch.setattr(rollouts, "STEPS_IN_ORDER", 5)
+    monkeypatch.setattr(fused_op, "STEPS_IN_ORDER", 5)
     end = mpm.rollout(step, state, 12, DT)
     assert len(sorts) == 3 and end.ids is None and end.mass is state.mass and end.material is state.material
     assert_equal(end, one_by_one(step, state, 12, DT))
@@ -125,7 +131,7 @@ def test_a_time_is_reached(device, sorts, monkeypatch):
     step, state = case(3, device)
     arrival = mpm.rollout_to(step, state, 1e-3, every=3)
     assert sorts == [state] and arrival.state.ids is None and arrival.state.mass is state.mass
-    monkeypatch.setattr(orders, "LEAST_PARTICLES", 1000)
+    monkeypatch.undo()
     expected = mpm.rollout_to(step, state, 1e-3, every=3)
     assert torch.equal(arrival.substeps, expected.substeps)
     assert_equal(arrival.state, expected.state)

@@ -144,7 +144,7 @@ def test_rollouts_take_such_steps_one_by_one(device):
     mpm.rollout(step, block_state(2, device), 9, DT)
     assert calls == pytest.approx([k * DT for k in range(9)])
     step.on_particles = None
-    assert step.explain(block_state(2, device)) == "all steps in one op"
+    assert step.explain(block_state(2, device)).startswith("all steps in one op")
 
 
 @pytest.mark.cuda

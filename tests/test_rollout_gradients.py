@@ -37,9 +37,9 @@ from helpers import TOLERANCE
 from torch import Tensor
 
 import torch_mpm as mpm
-from torch_mpm import rollouts
 from torch_mpm.ops.contact import obstacle_arguments
 from torch_mpm.ops.grid_update import wall_arguments
+from torch_mpm.rollouts import budget, fused_op
 
 ALL = mpm.Checkpoints(memory=1e9)
 """No step is taken again."""
@@ -223,8 +223,8 @@ def test_a_state_is_kept_every_so_many_steps(every, calls, device, monkeypatch):
         taken.append(arguments[2])
         return substeps(*arguments)
 
-    substeps = rollouts.substeps
-    monkeypatch.setattr(rollouts, "substeps", counted)
+    substeps = fused_op.substeps
+    monkeypatch.setattr(fused_op, "substeps", counted)
     step, state = mpm.Step(box(2), mpm.NeoHookean(E=1e4, nu=0.3)), blob(device, 2)
     mpm.rollout(step, state.replace(v=state.v.clone().requires_grad_()), 6, DT, checkpoint=every)
     assert len(taken) == calls
@@ -232,7 +232,7 @@ def test_a_state_is_kept_every_so_many_steps(every, calls, device, monkeypatch):
 
 
 def test_large_states_are_kept_every_sqrt_n_steps(device, monkeypatch):
-    monkeypatch.setattr(rollouts, "KEPT_BYTES", {"cpu": 1, "cuda": 1})
+    monkeypatch.setattr(budget, "KEPT_BYTES", {"cpu": 1, "cuda": 1})
     test_a_state_is_kept_every_so_many_steps(None, 3, device, monkeypatch)
 
 

@@ -432,7 +432,7 @@ def test_scenes_with_time_steps_and_clocks_of_their_own(device, dtype, transfer)
     for values in ([1.0, 0.5, 0.7], [1.0, 0.0, 0.5], [1.0, -1.0, 0.5]):
         dt = DT * torch.tensor(values, dtype=dtype, device=device)
         (step, state), (again, _) = each_scene(device, dtype, transfer), each_scene(device, dtype, transfer)
-        assert step.explain(state, dt) == "all steps in one op"
+        assert step.explain(state, dt).startswith("all steps in one op")
         with torch.no_grad():
             end, expected = mpm.rollout(step, state, 9, dt), one_by_one(again, state, 9, dt)
         if device == "cpu":
@@ -448,7 +448,7 @@ def test_clocks_take_no_gradients(device):
     dt = DT * torch.tensor([1.0, 0.5, 0.7], dtype=F64, device=device)
     end = mpm.rollout(step, state.replace(v=state.v.clone().requires_grad_()), 3, dt)
     assert end.v.requires_grad and not end.time.requires_grad
-    assert step.explain(end, dt).endswith("in one op")
+    assert step.explain(end, dt).startswith("all steps")
 
 
 def test_a_clock_of_each_scene_with_one_time_step(device):
@@ -472,7 +472,7 @@ def test_one_tensor_for_all_scenes(device, shape, paused):
     dt = torch.full(shape, 0.0 if paused else DT, dtype=F64, device=device)
     (step, state), (again, _) = each_scene(device), each_scene(device)
     for _ in range(2):  # the second from a time that is such a tensor
-        assert in_one_op(step, state) and step.explain(state, dt) == "all steps in one op"
+        assert in_one_op(step, state) and step.explain(state, dt).startswith("all steps in one op")
         with torch.no_grad():
             end, expected = mpm.rollout(step, state, 5, dt), one_by_one(again, state, 5, dt)
         assert end.time.shape == expected.time.shape == shape
@@ -481,7 +481,7 @@ def test_one_tensor_for_all_scenes(device, shape, paused):
         state = end
     again.law, again.grid = mpm.NeoHookean(E=1e4, nu=0.3), box()  # of one scene
     alone = blob(device).replace(time=torch.zeros(shape, dtype=F64, device=device))
-    assert again.explain(alone, dt) == "all steps in one op"
+    assert again.explain(alone, dt).startswith("all steps in one op")
 
 
 @pytest.mark.parametrize("gradient", [False, True])

@@ -42,7 +42,7 @@ from .ops import (
 from .parameters import PerMaterial, Table
 from .recording import Frames, frames
 from .rollout_estimate import RolloutEstimate, estimate_rollout
-from .rollouts import rollout, substeps_arguments
+from .rollouts import RolloutPlan, plan_rollout, rollout, substeps_arguments
 from .state import State
 from .step import Step
 
@@ -73,6 +73,7 @@ __all__ = [
     "PrecisionWarning",
     "Revolved",
     "RolloutEstimate",
+    "RolloutPlan",
     "SimulationError",
     "Sphere",
     "State",
@@ -94,6 +95,7 @@ __all__ = [
     "ops",
     "p2g",
     "particle_operations",
+    "plan_rollout",
     "polar",
     "quartic_return_map",
     "rollout",

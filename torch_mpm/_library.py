@@ -58,5 +58,10 @@ def _load_cuda() -> str | None:
     return _load(CUDA_LIBRARY, "cuda")
 
 
+def graph_loops() -> bool:
+    """Whether the device is not known to refuse CUDA graphs with loops; also where the CUDA library is not in use."""
+    return cuda_error is not None or bool(ctypes.CDLL(os.fspath(CUDA_LIBRARY)).torch_mpm_graph_loops())
+
+
 _load_cpu()
 cuda_error = _load_cuda()

@@ -14,8 +14,10 @@ from .cfl import chosen_dt
 from .checkpoints import Checkpoints
 from .errors import NUMBER_OR_TENSOR, check_count, check_number, shape_of
 from .graphs import CHUNK, replay_all
-from .orders import in_no_order, put_back, put_in_order
-from .rollouts import follows_paths, in_chunks, obstacle_to_substeps, rollout, wants_gradient
+from .orders import put_back, put_in_order
+from .rollouts import RolloutPlan, rollout
+from .rollouts.fused_op import in_calls
+from .rollouts.plan import facts_of, follows_paths, plan_call, plan_of_steps
 from .state import State
 from .step import Step
 
@@ -106,7 +108,7 @@ def rollout_to(
     check_count("every", every, 1)
     check_count("most", most, 1)
     given = _compensated(step, step.prepare(state), cfl, longest)
-    unsorted = in_no_order(given, most)
+    unsorted = plan_call(None, facts_of(step, given, 1, 1.0)._replace(steps=most)).order > 0
     start = put_in_order(step, given) if unsorted else given
     clocks = Clocks(step, start, time, cfl, longest, most, previous)
     with control_step(step, start, most, PACE, clocks.seconds) as left:
@@ -167,7 +169,8 @@ class Clocks:
 
     def advance(self, segments: int, n: int, checkpoint: int | Checkpoints | None) -> None:
         """Segments of n substeps each, for scenes with more than n remaining substeps."""
-        if segments < LEAST_REPLAYS + 1 or not self._replays():
+        plan = self._plan_of_replays(n) if segments > LEAST_REPLAYS else None
+        if plan is None:
             for _ in range(segments):
                 state, dt = self._next(self.state, n)
                 self.state = rollout(self.step, state, n, dt, checkpoint)
@@ -175,7 +178,7 @@ class Clocks:
 
         def segment(state: State) -> State:
             state, dt = self._next(state, n)
-            return in_chunks(self.step, state, n, dt)
+            return in_calls(self.step, state, n, dt, plan)
 
         # The first one allocates the records of steps.
         self.state = replay_all(self.step, segment, segment(self.state), segments - 1, max(CHUNK // n, 1))
@@ -189,12 +192,15 @@ class Clocks:
             taken = count
         self._take(self._left)
 
-    def _replays(self) -> bool:
-        """Whether segments are replays of a CUDA graph."""
+    def _plan_of_replays(self, n: int) -> RolloutPlan | None:
+        """The plan of a segment that is replayed as a CUDA graph; None where it cannot be."""
         step, state = self.step, self.state
-        if not state.x.is_cuda or follows_paths(step) or wants_gradient(step, state):
-            return False
-        return obstacle_to_substeps(step, state, self._dt.to(state.x.dtype)) is None
+        if not state.x.is_cuda or follows_paths(step):
+            return None
+        plan = plan_of_steps(step, state, n, self._dt.to(state.x.dtype))
+        if plan.executor != "fused" or plan.facts is None or plan.facts.gradients:
+            return None
+        return plan.of_sorted()  # or not worth a sort
 
     @torch.no_grad()
     def _next(self, state: State, n: int) -> tuple[State, Tensor]:

@@ -15,9 +15,8 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from .activation_record import counts_of, uncounted
-from .anomaly import detecting
 from .boundaries.control import control_step, steady
-from .capture import Recordings, Same, capturing, is_captured, is_transformed
+from .capture import Recordings, Same, capturing
 from .errors import check_count, shape_of
 from .graphs import WorkInFlight, copied, copy_all, tensors_of, time_tensor
 from .grid import own_pools
@@ -81,35 +80,8 @@ def captured(step: nn.Module, state: State | None, dt: float, n: int = 1) -> Cap
 # ---- in rollouts
 
 
-def obstacle_to_graphs(step: Any, state: State, dt: float | Tensor) -> str | None:
-    """Why `in_graphs` cannot take the steps from a state; None where it can."""
-    check_state(state)
-    if not has_graphs(state.x.device):
-        return "there are no graphs on the CPU"
-    if not isinstance(step, nn.Module):
-        return "it is no module"
-    if isinstance(dt, Tensor):
-        return "dt is a tensor"
-    if torch.compiler.is_compiling() or is_captured(state.x):
-        return "it is compiled or captured"
-    if is_transformed():
-        return "it is transformed"
-    if detecting():
-        return "anomaly detection looks at every step"
-    if any(has_hooks(module) for module in step.modules()):
-        return "there are hooks"
-    if (place := another_device(step, state.x.device)) is not None:
-        return f"a tensor of it is on {place}, the particles on {state.x.device}"
-    steps = [module for module in step.modules() if isinstance(module, Step)]
-    if any(part.integrator is not None for part in steps):
-        return "an implicit step waits for its solve"
-    if any(part.heat is not None and part.heat.method == "multigrid" for part in steps):
-        return "multigrid does all of its iterations in a graph"
-    return None
-
-
 def in_graphs(step: nn.Module, state: State, n: int, dt: float, most: int) -> State:
-    """The state n steps later, by graphs of `most` steps and of what is left; `obstacle_to_graphs` must be None.
+    """The state n steps later, by graphs of `most` steps and of what is left; a plan has it.
 
     What they read is kept for the backward pass, which replays the steps of all but the latest graph again.
     """

@@ -93,7 +93,7 @@ def check_number(
 
 def check_count(name: str, value: Any, least: int = 0) -> int:
     """An integer, not a bool."""
-    if isinstance(value, bool) or not isinstance(value, (numbers.Integral, torch.SymInt)):
+    if isinstance(value, bool) or not isinstance(value, (int, numbers.Integral, torch.SymInt)):
         raise TypeError(f"{name} must be a whole number, got {_described(value)}")
     if value < least:
         expected = f"be at least {least}" if least else "not be negative"

@@ -5,18 +5,12 @@ from __future__ import annotations
 import collections
 import threading
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from .activation_record import ActivationRecord
-from .capture import NUMBERS, GraphCache, Recordings, capturing, is_captured, is_of_library, is_transformed
-from .errors import shape_of
-from .grid import Grid
-from .laws.custom import CustomLaw
-from .parameters import has_hooks
-from .state import FIELDS, State, check_state
+from .capture import capturing
+from .state import FIELDS, State
 from .step import Step
 from .step_times import time_after
 
@@ -29,65 +23,8 @@ CHUNK = 64
 """Steps between two looks at how many blocks are active, where the pool follows the scene on CUDA."""
 
 
-def obstacle_to_replays(step: Any, state: State, dt: float | Tensor) -> str | None:
-    """Why `replayed` cannot take the steps from a state; None where it can. What the library does not know stays in
-    Python: a function may count its calls, or look at the time."""
-    check_state(state)
-    if type(step) is not Step:
-        return "it is not a plain Step"
-    if not state.x.is_cuda:
-        return "there are no graphs on the CPU"
-    if isinstance(dt, Tensor) or isinstance(state.time, Tensor):
-        return "dt or the time of the state is a tensor"
-    if torch.compiler.is_compiling() or is_captured(state.x):
-        return "it is compiled or captured"
-    if is_transformed():
-        return "it is transformed"
-    if torch.is_grad_enabled() and any(t.requires_grad for t in (*tensors_of(state).values(), *_all_of(step))):
-        return "it is differentiated"
-    if any(has_hooks(module) for module in step.modules()):
-        return "there are hooks"
-    if step.integrator is not None:
-        return "an implicit step waits for its solve"
-    if step.heat is not None and step.heat.method == "multigrid":
-        return "multigrid does all of its iterations in a graph"
-    return _foreign(step, state.x.device, [])
-
-
-_OWN = (GraphCache, Recordings, ActivationRecord, Grid)
-"""Made for graphs."""
-
-
-def _foreign(part: Any, device: torch.device, seen: list[Any]) -> str | None:
-    """What a step, or a part of it, has of the user's, or on another device; None for nothing."""
-    if part is None or isinstance(part, NUMBERS) or type(part) in _OWN or any(part is known for known in seen):
-        return None
-    if isinstance(part, Tensor):
-        return None if part.device == device else f"a tensor of it is on {part.device}, the particles on {device}"
-    seen.append(part)
-    if type(part) in (dict, collections.OrderedDict):
-        members = list(part.values())
-    elif type(part) in (list, tuple, set) or (_is_known(part) and isinstance(part, tuple)):
-        members = list(part)
-    elif _is_known(part):
-        members = list(vars(part).values())
-    else:
-        return f"it has something of the user's, {shape_of(part)}"
-    return next(filter(None, (_foreign(member, device, seen) for member in members)), None)
-
-
-def _is_known(part: Any) -> bool:
-    known = is_of_library(type(part)) or type(part) in (nn.ModuleList, nn.ModuleDict)
-    return known and not isinstance(part, CustomLaw)
-
-
-def _all_of(step: Step) -> list[Tensor]:
-    gravity = [step.gravity] if isinstance(step.gravity, Tensor) else []
-    return [*gravity, *step.parameters(), *step.buffers()]
-
-
 def replayed(step: Step, state: State, n: int, dt: float) -> State:
-    """The state n steps later, all but the first replays of a graph; `obstacle_to_replays` must be None.
+    """The state n steps later, all but the first replays of a graph; a plan has it.
 
     The first step from Python makes what steps keep, and asks about these tensors what would be a wait in the graph.
     """

@@ -7,29 +7,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .capture import is_captured
 from .laws import Mixture
 from .state import PARTICLE_FIELDS, State, _take_all
 from .step import Step
 
-LEAST_STEPS, LEAST_PARTICLES = 64, 2**15
-"""Number of steps from which a sort and its inverse pay; both cost about four steps, and a step of unsorted particles
-takes up to five times as long on a GPU.
-"""
 STEPS_IN_ORDER = 1024
 """Number of steps after which particles are sorted again."""
-
-
-def in_no_order(state: State, n: int) -> bool:
-    """Whether n steps may gain from a sort, for particles that the user has not sorted. A user who has (`ids`) sorts
-    again in time.
-    """
-    return state.ids is None and n >= LEAST_STEPS and len(state) >= LEAST_PARTICLES and wants_order(state.x)
-
-
-def wants_order(x: Tensor) -> bool:
-    """Whether ops do not sort by themselves, as they do on the CPU."""
-    return x.is_cuda and not is_captured(x)
 
 
 def put_in_order(step: Step, state: State) -> State:

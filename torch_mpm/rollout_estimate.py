@@ -13,7 +13,9 @@ from .checkpoints import Checkpoints, as_checkpoints
 from .errors import check_count, shape_of
 from .memory import in_words
 from .rollout_parts import Parts
-from .rollouts import EVERYTHING, bytes_kept, obstacle_to_substeps, resolved, rollout, steps_of_a_call
+from .rollouts import RolloutPlan, rollout
+from .rollouts.budget import EVERYTHING, bytes_kept
+from .rollouts.plan import plan_of_steps
 from .state import State
 from .step import Step
 from .step_cost import differentiable, seconds
@@ -83,11 +85,8 @@ def estimate_rollout(
     first = parts.first_with_gradient()
     start = differentiable(step.prepare(state) if isinstance(step, Step) else state)
     with aside(step, start.x), torch.enable_grad():
-        keeps_all = False
-        if kept is not None and kept.memory is not None:
-            kept = resolved(kept, step, start, n - first, dt)
-            keeps_all = kept is None
-        return _estimate(step, start, n - first, first, dt, kept, keeps_all)
+        plan = plan_of_steps(step, start, n - first, dt, kept)
+        return _estimate(step, start, n - first, first, dt, plan)
 
 
 def _estimate(
@@ -96,12 +95,12 @@ def _estimate(
     n: int,
     prefix: int,
     dt: float | Tensor,
-    kept: Checkpoints | None,
-    keeps_all: bool,
+    plan: RolloutPlan,
 ) -> RolloutEstimate:
-    """Estimate of n steps with gradients after a number of steps without."""
-    in_op = isinstance(step, Step) and obstacle_to_substeps(step, start, dt) is None
-    of_state, of_step = bytes_kept(step, start, dt)
+    """Of n steps with gradients, as planned, after `prefix` steps without."""
+    in_op, keeps_all = plan.executor == "fused", plan.stores_all
+    kept = None if keeps_all else plan.checkpoints
+    of_state, of_step = bytes_kept(step, start, dt, in_op)
     trial = max(min(n, TRIAL), 1)
     calls = trial if kept is not None and kept.states is not None else 1  # Between stored states.
 
@@ -128,7 +127,7 @@ def _estimate(
     if kept is None and (keeps_all or not in_op):
         return RolloutEstimate(of_state + n * of_step, 0, prefix * once + n * twice, 1, prefix + n, len(start))
     if kept is None:
-        kept = Checkpoints(every=min(steps_of_a_call(start, n), n))
+        kept = Checkpoints(every=plan.steps_per_call)
     states, again, held = kept.kept(n), kept.repetitions(n), min(kept.every or 1, n)
     extra = again
     if in_op:  # The op recomputes its own steps in any case: the time of both ways includes them.

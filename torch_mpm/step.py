@@ -518,42 +518,29 @@ class Step(TensorModule):
         if state is not None:
             resolution.check(self.grid, state.x.dtype)
 
-    def explain(self, state: State, dt: float | Tensor = 1.0, speed: float | None = None) -> str:
-        """How `rollout` takes steps from a state: many in one op, from a CUDA graph or from Python, and why; and of the
-        last whether its `graph` would replay some.
+    def explain(self, state: State, dt: float | Tensor = 1.0, speed: float | None = None, n: int = 1000) -> str:
+        """How `rollout` takes n steps from a state: the executor and the schedule of its plan, and in a line each why
+        the others were not chosen; see `plan_rollout`.
 
         Args:
             state: the particles.
             dt: time step [s].
             speed: of slow motion [m/s], for which explicit and implicit steps are compared too; waits for the device.
+            n: number of steps.
 
         Raises:
             TypeError, ValueError, NotImplementedError: as `torch_mpm.implicit.compare`, for a speed.
         """
+        from .rollouts import plan_rollout  # which needs a Step
+
         check_state(state)
         split_dt(dt, self.grid.scenes, state.x)
-        way = self._way(state, dt)
+        first, *others = str(plan_rollout(self, state, n, dt)).splitlines()
         if self.with_residual(state, dt).x_residual is not None:
-            way += ", with compensated positions"
-        return way if speed is None else f"{way}; {compare(self, state, speed)}"
-
-    def _way(self, state: State, dt: float | Tensor) -> str:
-        from .captured_steps import obstacle_to_graphs  # which needs a Step, as these do
-        from .graphs import obstacle_to_replays
-        from .rollouts import obstacle_to_substeps, wants_gradient
-
-        reason = obstacle_to_substeps(self, state, dt)
-        if reason is not None:
-            no_replays = obstacle_to_replays(self, state, dt)
-            if no_replays is None:
-                return f"from a CUDA graph of one step, because {reason}"
-            if not state.x.is_cuda:
-                return f"step by step, because {reason}"
-            no_graph = obstacle_to_graphs(self, state, dt)
-            also = f"; not from a CUDA graph, because {no_replays}" if no_replays != reason else ""
-            asked = "rollout(graph=...) replays some" if no_graph is None else f"nor with graph=..., because {no_graph}"
-            return f"step by step, because {reason}{also}; {asked}"
-        return f"all steps {'between two kept states ' if wants_gradient(self, state, dt=dt) else ''}in one op"
+            first += ", with compensated positions"
+        if speed is not None:
+            first += f"; {compare(self, state, speed)}"
+        return "\n".join([first, *others])
 
     def reset(self) -> None:
         """Forget the status of the steps so far."""

@@ -67,7 +67,8 @@ class OwnParticles {
  public:
   OwnField<T> x, v, C, F, J, residual, history;
 
-  OwnParticles(Substeps<T, D>& steps, const Tensor& packed_history, backend::Stream stream);
+  // Of steps that may change the order of the particles, or must not.
+  OwnParticles(Substeps<T, D>& steps, const Tensor& packed_history, bool sorts, backend::Stream stream);
 
   // Whether an activation may serve several substeps of a call. Where it does, G2P and the next P2G are one pass. Not
   // of deterministic grids: how long it lasts depends on all scenes, and on it how the sums of each are rounded. Nor
@@ -130,6 +131,7 @@ class OwnParticles {
 
   Substeps<T, D>& s_;
   const SubstepsInputs& in_;
+  const bool sorts_;
   backend::Stream stream_;
   OwnField<T> mass_, volume_;
   OwnField<T> kept_;                     // of FLIP
@@ -153,8 +155,9 @@ class OwnParticles {
 };
 
 template <class T, int D>
-OwnParticles<T, D>::OwnParticles(Substeps<T, D>& steps, const Tensor& packed_history, backend::Stream stream)
-    : s_(steps), in_(steps.in), stream_(stream) {
+OwnParticles<T, D>::OwnParticles(Substeps<T, D>& steps, const Tensor& packed_history, bool sorts,
+                                 backend::Stream stream)
+    : s_(steps), in_(steps.in), sorts_(sorts), stream_(stream) {
   const Tensor& like = in_.x;
   const int64_t P = like.size(0);
   const Particles<const T> given = given_particles<T, D>(in_, packed_history);
@@ -230,6 +233,7 @@ void OwnParticles<T, D>::find_laws() {
 // changes places a quarter of that; the way back in the end costs a substep.
 template <class T, int D>
 bool OwnParticles<T, D>::pays(int64_t following) {
+  if (!sorts_) return false;
   if (in_.lattice.deterministic())  // by nothing that depends on other scenes
     return following >= kDeterministicSteps && (in_.n - 1 - following) % kDeterministicSteps == 0;
   const int64_t P = in_.x.size(0);
@@ -288,7 +292,7 @@ void OwnParticles<T, D>::go_on(const int* status_before, int* status) {
 
 template <class T, int D>
 bool OwnParticles<T, D>::tries_to_last(int64_t following) {
-  if (!may_last(in_) || following < (rearranged_ ? kLeastPasses : kLeastLastingSteps)) return false;
+  if (!sorts_ || !may_last(in_) || following < (rearranged_ ? kLeastPasses : kLeastLastingSteps)) return false;
   return patience_ == 0 || --patience_ == 0;
 }
 

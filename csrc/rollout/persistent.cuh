@@ -3,6 +3,7 @@
 #include "cuda/barrier.cuh"
 #include "grid/status.h"
 #include "rollout/persistent.h"
+#include "rollout/plan.h"
 #include "transfer/advance_gather.cuh"
 #include "transfer/scatter.cuh"
 

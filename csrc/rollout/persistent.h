@@ -9,7 +9,6 @@
 // many substeps as that lasts, in place of three kernels for each.
 namespace mpm {
 
-constexpr int64_t kLeastPersistentSteps = 8, kMostPersistentParticles = 1 << 15, kMostPersistentBlocks = 256;
 // Strays have warps of their own, so that a new activation, and a launch, pay only where these are not enough: there
 // are so many particles for each of them.
 constexpr int kParticlesPerStray = 32;
@@ -20,13 +19,6 @@ constexpr int kStepsOfALaunch = 2048;  // at most
 // Items that a multiprocessor has room for at once.
 template <int D>
 constexpr int kItemsOfProcessor = D == 2 ? 2 : 1;
-
-// Particles of an item at most, which have a thread each: more where there are more particles, so that one wave of
-// thread blocks is enough for all items (`takes_few_blocks` in torch_mpm/rollouts.py).
-template <int D>
-constexpr int persistent_item(int64_t particles) {
-  return D == 2 ? 192 : particles <= 11000 ? 128 : particles <= 20000 ? 256 : 384;
-}
 
 // What the kernel has beside the particles and the nodes of P2G and G2P. Nodes are zero before and after.
 template <class T, int D>

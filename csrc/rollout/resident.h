@@ -1,7 +1,5 @@
 #pragma once
 
-#include <cmath>
-
 #include "grid/grid_update.h"
 #include "grid/obstacle.h"
 #include "transfer/advance.h"
@@ -10,22 +8,6 @@
 // Substeps of scenes that are small enough to stay on one multiprocessor each, on CUDA: a thread block takes a scene
 // through all substeps of a call, its nodes in shared memory, and nobody waits for other scenes.
 namespace mpm {
-
-// Where scenes are larger than that on average, or their domains, kernels of whole grids take them.
-template <int D>
-constexpr int kMostResidentParticles = D == 2 ? 4096 : 2304;
-constexpr int kMostResidentBlocks = 4096;
-constexpr int64_t kLeastResidentSteps = 4;
-
-// Whether they are faster than kernels of whole grids, by what both took on an H200 [µs].
-template <int D>
-bool resident_pays(int64_t particles, int64_t scenes) {
-  if (scenes == 1) return particles <= 96;  // else a kernel with many thread blocks is (rollout/persistent.h)
-  const double turns = std::fmax(1, double(scenes) / 132), size = double(particles) / double(scenes);
-  const double resident = 8 + turns * (2.5 + (D == 2 ? 0.019 : 0.021) * size);
-  const double together = 14 + double(particles) / 3500 + 0.07 * double(scenes);
-  return resident < together;
-}
 
 // Bytes at most, of float: of a particle, and of a block with its cells.
 constexpr int64_t kMostResidentRow = 96, kMostResidentBlock = 1600;

@@ -10,73 +10,102 @@
 #include "grid/walls.op.h"
 #include "laws/law.op.h"
 #include "rollout/kernels.h"
+#include "rollout/plan.op.h"
 #include "transfer/kernels.h"
 
 // Many steps in one call: activation, laws, P2G, grid update, obstacles, G2P, one after another as the ops of one step
 // do them, in buffers that belong to the call. What the ops of rollouts share.
 namespace mpm {
 
-#define MPM_SUBSTEPS_SCHEMA                                                                                            \
-  "Tensor x, Tensor v, Tensor mass, Tensor volume, Tensor? C, Tensor? F, Tensor? J, Tensor? residual, "                \
-  "Tensor[] history, Tensor? scene, Tensor? ids, Tensor? material, Tensor? previous_status, str laws, int[] options, " \
-  "Tensor[] parameters, "                                                                                              \
-  "int[] variables, int n, float dt, bool apic, float flip, bool wants_C, int stress_form, Tensor? "                   \
-  "gravity, " MPM_WALLS_SCHEMA                                                                                         \
-  ", Tensor? obstacles, Tensor? data, int[] shape, int[] sizes, int[] contact, int[] obstacle_scene, "                 \
-  "float[] start, float[] end, float time, int scenes, int max_blocks, bool grows, bool resident, bool records, "      \
-  "Tensor? "                                                                                                           \
-  "impulse, Tensor? scene_dt, Tensor? scene_time, " MPM_LATTICE_SCHEMA
-#define MPM_SUBSTEPS_PARAMETERS                                                                                      \
-  const Tensor &x, const Tensor &v, const Tensor &mass, const Tensor &volume, const OptionalTensor &C,               \
-      const OptionalTensor &F, const OptionalTensor &J, const OptionalTensor &residual, const Tensors &history,      \
-      const OptionalTensor &scene, const OptionalTensor &ids, const OptionalTensor &material,                        \
-      const OptionalTensor &previous_status, std::string laws, std::vector<int64_t> options,                         \
-      const Tensors &parameters, std::vector<int64_t> variables, int64_t n, double dt, bool apic, double flip,       \
-      bool wants_C, int64_t stress_form, const OptionalTensor &gravity, std::vector<int64_t> wall_kind,              \
-      std::vector<double> wall_plane, std::vector<double> wall_friction, const OptionalTensor &obstacle_table,       \
-      const OptionalTensor &obstacle_data, std::vector<int64_t> shape, std::vector<int64_t> sizes,                   \
-      std::vector<int64_t> contact_kind, std::vector<int64_t> obstacle_scene, std::vector<double> start,             \
-      std::vector<double> end, double time, int64_t scenes, int64_t max_blocks, bool grows, bool resident,           \
-      bool records, const OptionalTensor &impulse, const OptionalTensor &scene_dt, const OptionalTensor &scene_time, \
-      const std::vector<double>&lattice, const std::vector<int64_t>&layout
-#define MPM_SUBSTEPS_ARGUMENTS                                                                                         \
-  x, v, mass, volume, C, F, J, residual, history, scene, ids, material, previous_status, laws, options, parameters,    \
-      variables, n, dt, apic, flip, wants_C, stress_form, gravity, wall_kind, wall_plane, wall_friction,               \
-      obstacle_table, obstacle_data, shape, sizes, contact_kind, obstacle_scene, start, end, time, scenes, max_blocks, \
-      grows, resident, records, impulse, scene_dt, scene_time, PackedLattice(lattice, layout)
+// The arguments of a call: a kind, the name in the schema, and the member of SubstepsInputs. The only list of them.
+#define MPM_SUBSTEPS_LIST(FIRST, X)             \
+  FIRST(TENSOR, x, x)                           \
+  X(TENSOR, v, v)                               \
+  X(TENSOR, mass, mass)                         \
+  X(TENSOR, volume, volume)                     \
+  X(OPTIONAL, C, C)                             \
+  X(OPTIONAL, F, F)                             \
+  X(OPTIONAL, J, J)                             \
+  X(OPTIONAL, residual, residual)               \
+  X(TENSORS, history, history)                  \
+  X(OPTIONAL, scene, scene)                     \
+  X(OPTIONAL, ids, ids)                         \
+  X(OPTIONAL, material, material)               \
+  X(OPTIONAL, previous_status, previous_status) \
+  X(STRING, laws, laws)                         \
+  X(INTS, options, options)                     \
+  X(TENSORS, parameters, parameters)            \
+  X(INTS, variables, variables)                 \
+  X(INT, n, n)                                  \
+  X(FLOAT, dt, dt)                              \
+  X(BOOL, apic, apic)                           \
+  X(FLOAT, flip, flip)                          \
+  X(BOOL, wants_C, wants_C)                     \
+  X(INT, stress_form, stress_form)              \
+  X(OPTIONAL, gravity, gravity)                 \
+  X(INTS, wall_kind, wall_kind)                 \
+  X(FLOATS, wall_plane, wall_plane)             \
+  X(FLOATS, wall_friction, wall_friction)       \
+  X(OPTIONAL, obstacles, obstacle_table)        \
+  X(OPTIONAL, data, obstacle_data)              \
+  X(INTS, shape, shape)                         \
+  X(INTS, sizes, sizes)                         \
+  X(INTS, contact, contact_kind)                \
+  X(INTS, obstacle_scene, obstacle_scene)       \
+  X(FLOATS, start, start)                       \
+  X(FLOATS, end, end)                           \
+  X(FLOAT, time, time)                          \
+  X(INT, scenes, scenes)                        \
+  X(INT, max_blocks, max_blocks)                \
+  X(BOOL, grows, grows)                         \
+  X(BOOL, resident, resident)                   \
+  X(BOOL, records, records)                     \
+  X(OPTIONAL, impulse, impulse)                 \
+  X(OPTIONAL, scene_dt, scene_dt)               \
+  X(OPTIONAL, scene_time, scene_time)           \
+  X(FLOATS, lattice, lattice_numbers)           \
+  X(INTS, layout, lattice_layout)               \
+  X(CHOICE, schedule, schedule)
+
+// Of each kind what the schema calls it, and the type of a member.
+#define MPM_SCHEMA_TENSOR(name) "Tensor " #name
+#define MPM_SCHEMA_OPTIONAL(name) "Tensor? " #name
+#define MPM_SCHEMA_TENSORS(name) "Tensor[] " #name
+#define MPM_SCHEMA_STRING(name) "str " #name
+#define MPM_SCHEMA_INT(name) "int " #name
+#define MPM_SCHEMA_INTS(name) "int[] " #name
+#define MPM_SCHEMA_FLOAT(name) "float " #name
+#define MPM_SCHEMA_FLOATS(name) "float[] " #name
+#define MPM_SCHEMA_BOOL(name) "bool " #name
+#define MPM_SCHEMA_CHOICE(name) "int " #name "=-1"
+#define MPM_MEMBER_TENSOR Tensor
+#define MPM_MEMBER_OPTIONAL OptionalTensor
+#define MPM_MEMBER_TENSORS Tensors
+#define MPM_MEMBER_STRING std::string
+#define MPM_MEMBER_INT int64_t
+#define MPM_MEMBER_INTS std::vector<int64_t>
+#define MPM_MEMBER_FLOAT double
+#define MPM_MEMBER_FLOATS std::vector<double>
+#define MPM_MEMBER_BOOL bool
+#define MPM_MEMBER_CHOICE int64_t
+
+#define MPM_FIRST_SCHEMA(kind, name, member) MPM_SCHEMA_##kind(name)
+#define MPM_NEXT_SCHEMA(kind, name, member) ", " MPM_SCHEMA_##kind(name)
+#define MPM_FIRST_PARAMETER(kind, name, member) const MPM_MEMBER_##kind& member
+#define MPM_NEXT_PARAMETER(kind, name, member) , const MPM_MEMBER_##kind& member
+#define MPM_FIRST_ARGUMENT(kind, name, member) member
+#define MPM_NEXT_ARGUMENT(kind, name, member) , member
+#define MPM_DECLARE_MEMBER(kind, name, member) MPM_MEMBER_##kind member;
+
+#define MPM_SUBSTEPS_SCHEMA MPM_SUBSTEPS_LIST(MPM_FIRST_SCHEMA, MPM_NEXT_SCHEMA)
+#define MPM_SUBSTEPS_PARAMETERS MPM_SUBSTEPS_LIST(MPM_FIRST_PARAMETER, MPM_NEXT_PARAMETER)
+#define MPM_SUBSTEPS_ARGUMENTS MPM_SUBSTEPS_LIST(MPM_FIRST_ARGUMENT, MPM_NEXT_ARGUMENT)
 
 // The arguments of a call.
 struct SubstepsInputs {
-  Tensor x, v, mass, volume;
-  OptionalTensor C, F, J, residual;
-  Tensors history;
-  OptionalTensor scene, ids, material, previous_status;
-  std::string laws;
-  std::vector<int64_t> options;
-  Tensors parameters;
-  std::vector<int64_t> variables;
-  int64_t n;
-  double dt;
-  bool apic;
-  double flip;
-  bool wants_C;
-  int64_t stress_form;
-  OptionalTensor gravity;
-  std::vector<int64_t> wall_kind;
-  std::vector<double> wall_plane, wall_friction;
-  OptionalTensor obstacle_table, obstacle_data;
-  std::vector<int64_t> shape, sizes, contact_kind, obstacle_scene;
-  std::vector<double> start, end;
-  double time;
-  int64_t scenes, max_blocks;
-  bool grows, resident, records;
-  OptionalTensor impulse, scene_dt, scene_time;
-  PackedLattice lattice;
+  MPM_SUBSTEPS_LIST(MPM_DECLARE_MEMBER, MPM_DECLARE_MEMBER)
+  PackedLattice lattice{lattice_numbers, lattice_layout};
 };
-
-constexpr int64_t kMostSteps = 1 << 16;  // of one call, which nothing interrupts
-// Fewer particles are faster by kernels of their own: those that find nothing to do cost more than half of the bytes.
-constexpr int64_t kLeastMergedSteps = 4, kLeastMergedParticles = 1 << 18;
 
 // The parts of a list between commas or other marks.
 inline std::vector<std::string> parts(const std::string& list, char mark) {
@@ -296,6 +325,7 @@ struct Substeps {
   bool nodes_are_clear = false;  // when a step begins
   int used_slots = 0;            // on the CPU: that have a block, where the activation is asked to tell
   const int* previous_status = nullptr;
+  PlanFacts facts;
 
   explicit Substeps(const SubstepsInputs& inputs);
 
@@ -412,19 +442,12 @@ struct Substeps {
     activation.margin_blocks = int(std::clamp<int64_t>(2 * activation.max_blocks + 64, 0, std::max<int64_t>(most, 0)));
   }
 
-  // Whether node sums do not depend on the order of their terms, in deterministic mode on CUDA. Of a call without
-  // gradients: the backward pass takes its steps again one by one.
-  bool sums_are_fixed() const {
-    return MPM_BACKEND == MPM_BACKEND_IS_cuda && sizeof(T) == sizeof(float) && in.lattice.deterministic() &&
-           in.resident && !has(in.impulse) && !has(in.scene_dt) && !update.walls.mirrored;
-  }
-
   // On CUDA an activation may serve several substeps: blocks around those with particles are active too, and G2P tells
   // when they no longer suffice. Not where sums have an order, which is that of whole blocks, and not of FLIP, whose
   // second P2G and whose gather look in the blocks of the activation alone.
   void let_activations_last(backend::Stream stream) {
-    if (MPM_BACKEND == MPM_BACKEND_IS_cpu || (in.lattice.deterministic() && !sums_are_fixed()) || flips()) return;
-    if (sums_are_fixed()) fix_sums(stream);
+    if (MPM_BACKEND == MPM_BACKEND_IS_cpu || (in.lattice.deterministic() && !sums_are_fixed(facts)) || flips()) return;
+    if (sums_are_fixed(facts)) fix_sums(stream);
     drifts = empty_int(in.x, {2, sizeof(Drift) / sizeof(int)});
     torch::stable::zero_(drifts);
     p2g.drifted = true;
@@ -452,57 +475,19 @@ struct Substeps {
 
   // Where there is a kernel for it, P2G computes the stress itself.
   void fuse(bool keeps_stress) {
-    fused = calls.size() == 1 && !has(in.material) && in.lattice.order() == 2 && !p2g.deterministic &&
-            p2g.form == StressForm::mls && calls[0].law->kernels<T, D>().p2g;
+    fused = why_not_fused_law(facts).empty() && !p2g.deterministic && calls[0].law->kernels<T, D>().p2g;
     if (fused && !keeps_stress) forget_stress();
   }
 
-  // Whether P2G can move F or J, which it needs the affine field and a kernel of the law for.
-  bool can_move_late() const { return fused && drifts.defined() && in.apic && has(in.F) != has(in.J); }
-
-  // Whether it does where particles stay where they are in memory. Not of those that caches do not hold: they drift
-  // apart, where G2P can go in the order of memory and P2G cannot.
-  bool may_move_late() const { return can_move_late() && in.x.size(0) <= kMostLateParticles; }
-
-  // Whether G2P and the next P2G are one kernel while activations last, which a call that owns its particles can do.
-  // They are of one scene and have one material.
-  bool merges() const {
-    if (!can_move_late() || !in.resident || in.n < kLeastMergedSteps || in.x.size(0) < kLeastMergedParticles)
-      return false;
-    if (!next.emptied || has(in.impulse) || has(in.scene) || !calls[0].law->kernels<T, D>().g2p2g) return false;
-    for (size_t k = 0; k < calls[0].parameters.size(); k++)
-      if (laws[0].law.parameters[k].stride != 0) return false;
-    return in.x.size(0) <= INT32_MAX / 2;
-  }
-
-  // Whether a kernel takes many substeps of few particles, all but the first and the last of a call. It pays where some
-  // wave of thread blocks is enough for all items, as where the pool is small; one that grows and has room for all
-  // blocks is meant for it (`pool_of_call` in torch_mpm/rollouts.py).
-  bool persists() const {
-    const int64_t P = in.x.size(0);
-    if (!may_move_late() || !in.resident || in.n < kLeastPersistentSteps + 2) return false;
-    if (!next.emptied || has(in.impulse)) return false;
-    const bool few = in.grows ? in.max_blocks == update.block_count : in.max_blocks <= kMostPersistentBlocks;
-    // Of deterministic grids this must not depend on how far a pool has grown that was not meant for it.
-    const bool many = in.grows && !in.lattice.deterministic();
-    const int64_t most = many ? kMostPersistentParticles : kMostPersistentParticles / 2;
-    return few && P > 0 && P <= most && calls[0].law->kernels<T, D>().persistent;
+  // Whether P2G moves F or J, which it needs the affine field and a kernel of the law for, where particles stay where
+  // they are in memory.
+  bool moves_late() const {
+    return fused && drifts.defined() && in.apic && facts.one_deformation && in.x.size(0) <= kMostLateParticles;
   }
 
   void forget_stress() {
     stress = Tensor();
     for (LawUpdateArguments<T, D>& law : laws) law.stress = {};
-  }
-
-  // Whether scenes are taken through the call one by one, by their average size.
-  bool resides() {
-    const int64_t P = in.x.size(0);
-    if (!in.resident || in.n < kLeastResidentSteps || P > kMostResidentParticles<D> * in.scenes) return false;
-    if (!calls[0].law->kernels<T, D>().resident || calls.size() > 1 || has(in.material)) return false;
-    if (in.lattice.order() != 2 || p2g.form != StressForm::mls || has(in.impulse) || update.walls.mirrored || flips())
-      return false;
-    if (P == 0 || activation.geometry.blocks_per_scene > kMostResidentBlocks) return false;
-    return (in.lattice.deterministic() && !sums_are_fixed()) || resident_pays<D>(P, in.scenes);
   }
 
   // Of the substeps that read what others of the same parity have written. The last one is activated in any case, so
@@ -618,6 +603,9 @@ struct Substeps {
 
   void make_pool(backend::Stream stream);
   void use_pool();
+
+ private:
+  PlanFacts facts_of_call() const;
 };
 
 template <class T, int D>
@@ -688,6 +676,41 @@ Substeps<T, D>::Substeps(const SubstepsInputs& inputs) : in(inputs) {
   }
   advance.gather.moment_scale = in.lattice.inverse_inertia();
   advance.gather.lost = NAN;
+  facts = facts_of_call();
+}
+
+// But for those of the stream and the device, which are not looked at where nothing depends on them.
+template <class T, int D>
+PlanFacts Substeps<T, D>::facts_of_call() const {
+  PlanFacts f;
+  f.cuda = MPM_BACKEND != MPM_BACKEND_IS_cpu;
+  f.float32 = sizeof(T) == sizeof(float);
+  f.dim = D;
+  f.particles = in.x.size(0);
+  f.scenes = in.scenes;
+  f.steps = in.n;
+  f.blocks_per_scene = activation.geometry.blocks_per_scene;
+  f.max_blocks = in.max_blocks;
+  f.grows = in.grows;
+  f.deterministic = in.lattice.deterministic();
+  f.quadratic = in.lattice.order() == 2;
+  f.apic = in.apic;
+  f.flips = flips();
+  f.mls = p2g.form == StressForm::mls;
+  f.mirrors = update.walls.mirrored;
+  f.impulses = has(in.impulse);
+  f.clocks = has(in.scene_dt);
+  f.scene_ids = has(in.scene);
+  f.sorted = has(in.ids);
+  f.laws = int64_t(calls.size());
+  f.materials = has(in.material);
+  f.additive = calls[0].law->info.additive;
+  f.uniform_parameters = true;
+  for (size_t k = 0; k < calls[0].parameters.size(); k++) f.uniform_parameters &= laws[0].law.parameters[k].stride == 0;
+  f.one_deformation = has(in.F) != has(in.J);
+  f.gradients = !in.resident;
+  f.records = in.records;
+  return f;
 }
 
 // For the arguments' number of blocks.

@@ -13,6 +13,8 @@
 namespace mpm {
 namespace {
 
+thread_local int64_t schedule_of_latest = kChoose;  // of this backend
+
 Tensor copy_of(const Tensor& t) {
   Tensor copy = empty(t, sizes_of(t));
   torch::stable::copy_(copy, t);
@@ -58,14 +60,16 @@ void take_resident(Substeps<T, D>& s, int64_t n, int64_t after, double time, con
 }
 #endif
 
+#if MPM_BACKEND == MPM_BACKEND_IS_cuda
+std::atomic<bool> loops_are_refused = CUDART_VERSION < 13000;
+#endif
+
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda && CUDART_VERSION >= 13000
 // Substeps from the second on until the last alone is left, of particles that move in place. The status of the first is
 // in `status`, and is that of all of them in the end. False where the device takes no such graph: none, where processes
 // share it by MPS.
 template <class T, int D>
 bool take_persistent(Substeps<T, D>& s, int* activated, int* status, backend::Stream stream) {
-  static std::atomic<bool> refused = false;
-  if (refused) return false;
   const SubstepsInputs& in = s.in;
   PersistentArguments<T, D> a{{s.update, s.contact, s.obstacles, s.activation.max_blocks}, s.p2g, s.late, s.advance};
   const int64_t rows = s.pool.nodes.size(0);
@@ -106,9 +110,9 @@ bool take_persistent(Substeps<T, D>& s, int* activated, int* status, backend::St
   } catch (const std::exception&) {
     if (works_on == device) throw;
     cudaGetLastError();  // nothing was launched
-    refused = true;
+    loops_are_refused = true;
   }
-  return !refused;
+  return !loops_are_refused;
 }
 #endif
 
@@ -118,6 +122,7 @@ using Results = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tenso
 template <class T, int D>
 std::optional<Results> take_recorded(const SubstepsInputs& in, backend::Stream stream) {
   Recorded<T, D> r(in, {}, stream);
+  schedule_of_latest = schedule_of(in.schedule, r.steps.facts);
   bool room = false;
   with_team(in.x.size(0) * in.n, [&] { room = r.take(); });
   if (!room) return {};
@@ -172,14 +177,16 @@ Results no_step(const SubstepsInputs& in, const Tensor& history, const Tensor& s
 template <class T, int D>
 Results take_steps(const SubstepsInputs& in, backend::Stream stream) {
   Substeps<T, D> s(in);
+  s.facts.records = false;  // or they would be recorded
+  const bool sorts = (schedule_of_latest = schedule_of(in.schedule, s.facts)) == kSortedCpu;
   const Tensor history = packed_history(in.x, in.history, s.columns);
   Tensor status[] = {empty_int(in.x, {1 + in.scenes, kStatusSize}), empty_int(in.x, {1 + in.scenes, kStatusSize})};
   Tensor impulse, time;
   if (has(in.impulse)) s.add_impulses_to(impulse = copy_of(*in.impulse));
   if (has(in.scene_time)) s.count_scene_times(time = copy_of(*in.scene_time));
-  if (OwnParticles<T, D>::may_last(in)) s.make_margin();
+  if (sorts && OwnParticles<T, D>::may_last(in)) s.make_margin();
   s.make_pool(stream);
-  OwnParticles<T, D> particles(s, history, stream);
+  OwnParticles<T, D> particles(s, history, sorts, stream);
   const int* before = s.previous_status;
   int64_t step = 0, last = 0;  // the last status
   with_team(in.x.size(0) * in.n, [&] {
@@ -208,11 +215,11 @@ Results take_steps(const SubstepsInputs& in, backend::Stream stream) {
 
 #endif
 
-Results substeps(MPM_SUBSTEPS_PARAMETERS) {
-  const SubstepsInputs in{MPM_SUBSTEPS_ARGUMENTS};
+Results run(const SubstepsInputs& in) {
+  const Tensor& x = in.x;
   check_positions(x);
   const DeviceScope device(x);
-  if (records && !has(impulse) && x.size(0) > 0) {
+  if (in.records && !has(in.impulse) && x.size(0) > 0) {
     std::optional<Results> recorded;
     dispatch(x, [&]<class T, int D>() { recorded = take_recorded<T, D>(in, device.stream()); });
     if (recorded) return *recorded;
@@ -222,27 +229,27 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
   dispatch(x, [&]<class T, int D>() { results = take_steps<T, D>(in, device.stream()); });
   return results;
 #else
-  const int64_t P = x.size(0), D_ = x.size(1);
+  const int64_t P = x.size(0), D_ = x.size(1), n = in.n;
   Tensor x_[] = {empty_particles(x, {P, D_}), Tensor()};
-  Tensor F_[] = {result(x, has(F), {P, D_, D_}), Tensor()};
-  Tensor J_[] = {result(x, has(J), {P}), Tensor()};
-  Tensor v_ = empty_particles(x, {P, D_}), C_ = result(x, wants_C, {P, D_, D_}), history_;
-  Tensor residual_ = result(x, has(residual), {P, D_});  // which G2P alone reads
-  Tensor status[] = {empty_int(x, {1 + scenes, kStatusSize}), empty_int(x, {1 + scenes, kStatusSize})};
+  Tensor F_[] = {result(x, has(in.F), {P, D_, D_}), Tensor()};
+  Tensor J_[] = {result(x, has(in.J), {P}), Tensor()};
+  Tensor v_ = empty_particles(x, {P, D_}), C_ = result(x, in.wants_C, {P, D_, D_}), history_;
+  Tensor residual_ = result(x, has(in.residual), {P, D_});  // which G2P alone reads
+  Tensor status[] = {empty_int(x, {1 + in.scenes, kStatusSize}), empty_int(x, {1 + in.scenes, kStatusSize})};
   Tensor impulse_, time_;
   int last = 0;  // of the two buffers, that of the last step
   const auto start_in_results = [&] {
     torch::stable::copy_(x_[0], x);
-    torch::stable::copy_(v_, v);
-    if (has(F)) torch::stable::copy_(F_[0], *F);
-    if (has(J)) torch::stable::copy_(J_[0], *J);
-    if (has(residual)) torch::stable::copy_(residual_, *residual);
-    if (wants_C) has(C) ? torch::stable::copy_(C_, *C) : torch::stable::zero_(C_);
+    torch::stable::copy_(v_, in.v);
+    if (has(in.F)) torch::stable::copy_(F_[0], *in.F);
+    if (has(in.J)) torch::stable::copy_(J_[0], *in.J);
+    if (has(in.residual)) torch::stable::copy_(residual_, *in.residual);
+    if (in.wants_C) has(in.C) ? torch::stable::copy_(C_, *in.C) : torch::stable::zero_(C_);
   };
   dispatch(x, [&]<class T, int D>() {
     const backend::Stream stream = device.stream();
     Substeps<T, D> s(in);
-    history_ = packed_history(x, history, s.columns);
+    history_ = packed_history(x, in.history, s.columns);
     const int* before = s.previous_status;
 
     Particles<const T> from = given_particles<T, D>(in, history_);
@@ -250,15 +257,19 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
       return {field<T>(x_[k]), field<T>(v_),        field<T>(C_),      field<T>(F_[k]),
               field<T>(J_[k]), field<T>(residual_), field<T>(history_)};
     };
-    if (has(impulse)) {
-      impulse_ = copy_of(*impulse);
+    if (has(in.impulse)) {
+      impulse_ = copy_of(*in.impulse);
       s.add_impulses_to(impulse_);
     }
-    if (has(scene_time)) {
-      time_ = copy_of(*scene_time);
+    if (has(in.scene_time)) {
+      time_ = copy_of(*in.scene_time);
       s.count_scene_times(time_);
     }
-    if (s.resides()) {
+    s.facts.captured = is_recorded(stream);
+    s.facts.graph_loops = !loops_are_refused;
+    const Schedule schedule = schedule_of(in.schedule, s.facts);
+    schedule_of_latest = schedule;
+    if (schedule == kBlockPerScene) {
       start_in_results();
       s.forget_stress();
       s.make_pool(stream);
@@ -268,10 +279,10 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
       // The last one has an activation of its own, so that the status tells how many blocks there are by then.
       int* const activated = static_cast<int*>(status[1].data_ptr());
       int* const now = static_cast<int*>(status[0].data_ptr());
-      double last_time = time;
-      for (int64_t k = 1; k < n; k++) last_time += dt;
+      double last_time = in.time;
+      for (int64_t k = 1; k < n; k++) last_time += in.dt;
       s.activate(before, activated, stream);
-      take_resident(s, n - 1, 0, time, activated, now, stream);
+      take_resident(s, n - 1, 0, in.time, activated, now, stream);
       s.activate(now, activated, stream);
       take_resident(s, 1, n - 1, last_time, activated, now, stream);
       after_substeps(P, n, stream);
@@ -281,13 +292,13 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
     s.fuse(false);
     s.make_pool(stream);
     s.count_time(before, stream);
-    if (s.merges()) return Merged<T, D>(s, buffers(0), status, stream).take_all(from, before);
-    const bool late = s.may_move_late();  // then F and J stay where they are
+    if (schedule == kFusedG2P2G) return Merged<T, D>(s, buffers(0), status, stream).take_all(from, before);
+    const bool late = s.moves_late();  // then F and J stay where they are
     x_[1] = result(x, n > 1, {P, D});
-    F_[1] = late ? F_[0] : result(x, has(F) && (n > 1 || s.plastic), {P, D, D});
-    J_[1] = late ? J_[0] : result(x, has(J) && n > 1, {P});
-    if (s.plastic && has(F) && !late) {  // which laws change where it stands
-      torch::stable::copy_(F_[1], *F);
+    F_[1] = late ? F_[0] : result(x, has(in.F) && (n > 1 || s.plastic), {P, D, D});
+    J_[1] = late ? J_[0] : result(x, has(in.J) && n > 1, {P});
+    if (s.plastic && has(in.F) && !late) {  // which laws change where it stands
+      torch::stable::copy_(F_[1], *in.F);
       from.F = field<const T>(F_[1]);
     }
     bool first = true;
@@ -308,7 +319,7 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
     };
     int64_t step = 0;
 #if CUDART_VERSION >= 13000
-    if (s.persists() && !is_recorded(stream)) {
+    if (schedule == kPersistent) {
       s.activation.most_of_item = persistent_item<D>(in.x.size(0));
       take(0, false, stream);
       const Particles<T> in_place = buffers(0);
@@ -322,6 +333,9 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
         after_substeps(P, n, stream);
         return;
       }
+      if (in.schedule == kChoose) schedule_of_latest = kPerStep;  // of the rest
+      s.facts.graph_loops = !loops_are_refused;
+      schedule_of(in.schedule, s.facts);  // which is an error if it was asked for
     }
 #endif
     while (step < n) {
@@ -338,6 +352,11 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
 #endif
 }
 
+Results substeps(MPM_SUBSTEPS_PARAMETERS) { return run(SubstepsInputs{MPM_SUBSTEPS_ARGUMENTS}); }
+
+// By which the latest call on the device of a tensor went, of this thread.
+int64_t latest_schedule(const Tensor&) { return schedule_of_latest; }
+
 }  // namespace
 }  // namespace mpm
 
@@ -346,7 +365,16 @@ STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
   m.def("substeps(" MPM_SUBSTEPS_SCHEMA
         ") -> (Tensor x, Tensor v, Tensor C, Tensor F, Tensor J, Tensor history, Tensor status, Tensor "
         "impulse, Tensor time, Tensor residual, Tensor record)");
+  m.def("latest_schedule(Tensor like) -> int");
 }
 #endif
 
-MPM_LIBRARY_IMPL(m) { m.impl("substeps", TORCH_BOX(&mpm::substeps)); }
+MPM_LIBRARY_IMPL(m) {
+  m.impl("substeps", TORCH_BOX(&mpm::substeps));
+  m.impl("latest_schedule", TORCH_BOX(&mpm::latest_schedule));
+}
+
+#if MPM_BACKEND == MPM_BACKEND_IS_cuda
+// Whether the device is not known to refuse CUDA graphs with loops.
+extern "C" __attribute__((visibility("default"))) int torch_mpm_graph_loops() { return !mpm::loops_are_refused; }
+#endif

@@ -58,8 +58,6 @@ struct G2PAdvanceArguments {
   bool loads_ahead = false;
 };
 
-constexpr int64_t kMostLateParticles = 1 << 18;
-
 // Update of F or J that G2P defers to the next P2G, which loads them anyway and has the affine field for it.
 template <class T, int D>
 struct LateDeformation {

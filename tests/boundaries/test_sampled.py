@@ -139,7 +139,7 @@ def test_a_rollout_around_a_sampled_mesh_goes_in_one_op(device):
         body = mpm.boundaries.Obstacle(shape, (0.5, 0.5, 0.5), "separate", friction=0.2)
         step = mpm.Step(grid, mpm.NeoHookean(E=1e4, nu=0.3), (0.0, -9.8, 0.0), boundaries=[body])
         state = mpm.State.at_rest(points, velocity=(0.0, -2.0, 0.0), dtype=torch.float64, device=device)
-        assert (step.explain(state) == "all steps in one op") == (shape is not mesh)
+        assert (step.explain(state).startswith("all steps in one op")) == (shape is not mesh)
         with torch.no_grad():
             ends.append(mpm.rollout(step, state, 40, 5e-4))
     assert float((ends[0].v - ends[0].v.mean(0)).norm(dim=1).max()) > 0.5

@@ -394,7 +394,7 @@ def test_substeps_are_taken_together(device):
     other, _ = pair({"E": 1e5, "nu": 0.3, "density": 500.0}, shear, device)
     other.finalize_mu_lam()
     other.add_bounding_box()
-    assert sim.step.explain(sim.state, DT) == "all steps in one op"
+    assert sim.step.explain(sim.state, DT).startswith("all steps in one op")
     for k in range(30):
         sim.p2g2p(k, DT)
         other.p2g2p(k, DT)

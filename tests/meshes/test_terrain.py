@@ -75,7 +75,7 @@ def test_a_body_lies_on_sampled_terrain(device):
     step = mpm.Step(grid, mpm.NeoHookean(E=1e4, nu=0.3), (0.0, 0.0, -9.8), boundaries=[Obstacle(sampled, (0, 0, 0))])
     points = mpm.seed.box((0.3, 0.3, 0.4), (0.7, 0.7, 0.6), grid, dtype=torch.float64)
     state = mpm.State.at_rest(points, velocity=(0, 0, -1.0), dtype=torch.float64, device=device)
-    assert step.explain(state) == "all steps in one op"
+    assert step.explain(state).startswith("all steps in one op")
     with torch.no_grad():
         end = mpm.rollout(step, state, 150, 2e-3)
     above = end.x[:, 2].cpu() - (0.2 + 0.3 * (end.x[:, :2].cpu() - 0.5).square().sum(1))

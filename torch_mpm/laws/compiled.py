@@ -44,6 +44,8 @@ PLASTIC_VOLUME = "log_plastic_volume"
 """History of laws whose plastic flow changes the volume: ln J_p."""
 ARGUMENTS = {"eta": "viscosity"}
 """Names of arguments that are stored under another name."""
+_OF_MODULES = frozenset(vars(nn.Module()))
+"""Attributes of every module, of which no parameter is made."""
 FIGURES = ("stress", "stiffness", "energy_density")
 """Values of a law that a survey needs."""
 
@@ -324,7 +326,8 @@ class CompiledLaw(Material):
             self.check_parameters(particles, state.scenes)
         if torch.compiler.is_compiling() or any(t.requires_grad for t in tensors):
             return self._convert(state)
-        numbers = [value for value in vars(self).values() if isinstance(value, Real)]
+        own = [value for name, value in vars(self).items() if name not in _OF_MODULES]
+        numbers = [value for value in own if isinstance(value, Real)]
         if any(t.numel() == particles for t in tensors):
             order = state.ids  # Only parameters that differ by particle.
         key = (x.dtype, x.device, order, *numbers, *tensors)

@@ -60,13 +60,14 @@ def register_autograd(
     The tensors of a `topology` are integers: they are passed on in their list, and `save_with_topology` stores them.
 
     Args:
-        name: name of the op. No argument may have a default value.
+        name: name of the op.
         backward: function (ctx, *grads) that returns the gradients of all arguments; a list of them for a list of
             tensors.
         setup: function (ctx, inputs, output), or None where backward needs nothing.
     """
     op = getattr(torch.ops.torch_mpm, name).default
     lists = [i for i, a in enumerate(op._schema.arguments) if str(a.type) == "List[Tensor]" and a.name != "topology"]
+    defaults = tuple(a.default_value for a in op._schema.arguments)  # of last arguments, which torch leaves out
 
     def forward(ctx: Any, lengths: list[int], *flat: Any) -> Any:
         arguments = _nested(flat, lists, lengths)
@@ -90,7 +91,8 @@ def register_autograd(
     # `Function.apply` handles the levels of torch.func first; the dispatcher has done so where it calls `kernel`.
     record = super(torch.autograd.Function, function).apply
 
-    def kernel(*arguments: Any) -> Any:
+    def kernel(*given: Any) -> Any:
+        arguments = (*given, *defaults[len(given) :])
         if forward_ad._current_level >= 0:
             _refuse_tangents(name, _flat(arguments, lists))
         if not (torch.is_grad_enabled() and torch._C._any_requires_grad(*arguments)):

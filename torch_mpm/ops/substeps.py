@@ -83,7 +83,7 @@ def _fake(
     *rest: Any,
 ) -> tuple[Tensor | None, ...]:
     P, D = sizes(x, "x", 2)
-    given = dict(zip(ARGUMENTS[9:], rest, strict=True))
+    given = dict(zip(ARGUMENTS[9:], rest, strict=False))  # torch leaves a default at the end out
     wants_C, scenes, impulse = given["wants_C"], given["scenes"], given["impulse"]
     return (
         soa_empty(x, (P, D)),
@@ -106,7 +106,7 @@ def _fake_record(x: Tensor) -> Tensor:
 
 @torch.library.register_fake("torch_mpm::substeps_backward")
 def _backward_fake(grad_x, grad_v, grad_C, grad_F, grad_J, grad_history, grad_impulse, needs, record, *arguments):
-    given = dict(zip(_SCHEMA, arguments, strict=True))
+    given = dict(zip(_SCHEMA, arguments, strict=False))
     x, history = given["x"], given["history"]
     P, D = sizes(x, "x", 2)
     blocks = given["scenes"] * math.prod(given["layout"][2:])

@@ -1,0 +1,309 @@
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <string>
+
+// Which way a call of many substeps goes: the facts of the call, the schedules with what each supports and when it
+// pays, and the choice. The only place of these thresholds. Host code without tensors, so that a build without CUDA
+// plans for CUDA too.
+namespace mpm {
+
+// INT(name) and BOOL(name) in the order of the op `plan_substeps`.
+#define MPM_PLAN_FACTS(INT, BOOL)                                                            \
+  BOOL(cuda) /* the particles are on a CUDA device */                                        \
+  BOOL(float32)                                                                              \
+  INT(dim)                                                                                   \
+  INT(particles)                                                                             \
+  INT(scenes)                                                                                \
+  INT(steps)            /* that are left of the rollout, or those of the call */             \
+  INT(blocks_per_scene) /* of the domain */                                                  \
+  INT(max_blocks)       /* of the pool now; negative where no activation has measured it */  \
+  BOOL(grows)           /* the pool follows the scene */                                     \
+  BOOL(deterministic)                                                                        \
+  BOOL(quadratic) /* weights, else cubic */                                                  \
+  BOOL(apic)                                                                                 \
+  BOOL(flips)     /* a share of FLIP velocities is kept */                                   \
+  BOOL(mls)       /* the stress form, else that of the gradients of the weights */           \
+  BOOL(mirrors)   /* among the walls */                                                      \
+  BOOL(impulses)  /* on obstacles and walls are summed up */                                 \
+  BOOL(clocks)    /* each scene has its own time step and time */                            \
+  BOOL(scene_ids) /* particles have the number of a scene */                                 \
+  BOOL(sorted)    /* particles have ids: their owner sorts them */                           \
+  INT(laws)                                                                                  \
+  BOOL(materials)          /* particles have the number of a material */                     \
+  BOOL(additive)           /* the first law is one that is added to others */                \
+  BOOL(uniform_parameters) /* each parameter of the laws has one value */                    \
+  BOOL(one_deformation)    /* either F or J moves, not both */                               \
+  BOOL(gradients)          /* are wanted */                                                  \
+  BOOL(records)            /* what gradients need is stored */                               \
+  BOOL(captured)           /* the stream is recorded into a CUDA graph */                    \
+  BOOL(graph_loops)        /* the device runs CUDA graphs with loops: CUDA 13, and no MPS */ \
+  INT(path_bytes)          /* of the table of obstacles on paths, of one substep */
+
+struct PlanFacts {
+#define MPM_INT(name) int64_t name = 0;
+#define MPM_BOOL(name) bool name = false;
+  MPM_PLAN_FACTS(MPM_INT, MPM_BOOL)
+#undef MPM_INT
+#undef MPM_BOOL
+
+  int64_t blocks() const { return std::max<int64_t>(scenes, 1) * blocks_per_scene; }
+};
+
+// ---- thresholds
+
+constexpr int64_t kMostSteps = 1 << 16;  // of one call, which nothing interrupts
+
+// A block per scene. Where scenes are larger than that on average, or their domains, kernels of whole grids take them.
+template <int D>
+constexpr int kMostResidentParticles = D == 2 ? 4096 : 2304;
+constexpr int kMostResidentBlocks = 4096;
+constexpr int64_t kLeastResidentSteps = 4;
+
+// Fused G2P2G. Fewer particles are faster by kernels of their own: those that find nothing to do cost more than half of
+// the bytes.
+constexpr int64_t kLeastMergedSteps = 4, kLeastMergedParticles = 1 << 18;
+// Particles that P2G moves in place, without G2P2G: not of those that caches do not hold, which drift apart, where G2P
+// can go in the order of memory and P2G cannot.
+constexpr int64_t kMostLateParticles = 1 << 18;
+
+// Persistent. A deterministic grid, or a pool of fixed size, takes half as many particles.
+constexpr int64_t kLeastPersistentSteps = 10, kMostPersistentParticles = 1 << 15, kMostPersistentBlocks = 256;
+// Particles of an item at most, which have a thread each: more where there are more particles, so that one wave of
+// thread blocks is enough for all items.
+template <int D>
+constexpr int persistent_item(int64_t particles) {
+  return D == 2 ? 192 : particles <= 11000 ? 128 : particles <= 20000 ? 256 : 384;
+}
+// Of a domain, and of work in a step, for which about one wave of thread blocks is enough.
+constexpr int64_t kFewBlocks = 1 << 12;
+template <int D>
+constexpr int kFewItems = D == 2 ? 250 : 140;
+
+// The pool of a call on CUDA that follows the scene: nobody looks meanwhile whether it must grow.
+constexpr int64_t kGrowingSteps = 64;
+// So many particles take as much memory as the nodes of a block do. A pool that they leave room for is looked at less
+// often: one with kRoomy times the blocks of one that follows the scene after kRoomySteps, twice that with twice as
+// many, and one that has room for all blocks of the domain after kWholeSteps.
+constexpr int64_t kParticlesPerBlock = 32, kRoomy = 3, kRoomySteps = 256, kWholeSteps = 1024;
+// Particles times steps of a call on CUDA that may be one kernel, which nothing interrupts: about a quarter of a second
+// on an H100. A call of fewer steps would cost more, and fewer particles take no less time.
+constexpr int64_t kWorkOfCall = 1 << 28, kLeastStepsOfCall = 512, kLeastParticlesOfCall = 1 << 13;
+constexpr int64_t kMostPathBytes = 1 << 26;  // of a call, for obstacles on paths
+
+// For which a sort of particles in no order and the way back, together some four steps, are worth it: of such particles
+// a step takes up to five times as long on a GPU.
+constexpr int64_t kLeastSortedSteps = 64, kLeastSortedParticles = 1 << 15;
+
+// Whether a block per scene is faster than kernels of whole grids, by what both took on an H200 [µs].
+template <int D>
+bool resident_pays(int64_t particles, int64_t scenes) {
+  if (scenes == 1) return particles <= 96;  // else a kernel with many thread blocks is (rollout/persistent.h)
+  const double turns = std::fmax(1, double(scenes) / 132), size = double(particles) / double(scenes);
+  const double resident = 8 + turns * (2.5 + (D == 2 ? 0.019 : 0.021) * size);
+  const double together = 14 + double(particles) / 3500 + 0.07 * double(scenes);
+  return resident < together;
+}
+
+// About how many items the particles of a step make if the pool has `blocks` (rollout/persistent.h).
+inline double items_of_step(const PlanFacts& f, int64_t blocks) {
+  const double active = double(blocks) / 1.5;                                // of a pool that has grown
+  if (f.dim == 2) return std::max(0.8 * active, double(f.particles) / 150);  // most have particles, seldom two items
+  return 0.5 * active + double(f.particles) / (1.25 * persistent_item<3>(f.particles));
+}
+
+// ---- schedules
+
+enum Schedule : int64_t {
+  kChoose = -1,
+  kPerStep,        // kernel by kernel
+  kFusedG2P2G,     // G2P and the next P2G in one kernel, of particles that the call owns (CUDA)
+  kPersistent,     // one kernel of thread blocks that all run at once (CUDA)
+  kBlockPerScene,  // a thread block takes a scene through all substeps (CUDA)
+  kSortedCpu       // particles lie in the order of their cells; G2P and the next P2G in one pass (CPU)
+};
+
+// Each function gives the reason why not, or nothing.
+struct ScheduleEntry {
+  Schedule schedule;
+  const char* name;
+  std::string (*unsupported)(const PlanFacts&);
+  std::string (*unprofitable)(const PlanFacts&);  // of a call that is supported
+};
+
+// Whether sums of nodes do not depend on the order of their terms, in deterministic mode on CUDA. Of a call without
+// gradients: the backward pass takes its steps again one by one.
+inline bool sums_are_fixed(const PlanFacts& f) {
+  return f.cuda && f.float32 && f.deterministic && !f.gradients && !f.impulses && !f.clocks && !f.mirrors;
+}
+
+// Why no kernel can take a law and P2G together.
+inline std::string why_not_fused_law(const PlanFacts& f) {
+  if (!f.cuda) return "the particles are on the CPU";
+  if (!f.float32) return "the particles are in float64";
+  if (f.laws != 1 || f.materials) return "there is more than one law";
+  if (f.additive) return "the law is one that is added to others";
+  if (!f.quadratic) return "the weights are cubic";
+  if (!f.mls) return "the stress form is not mls";
+  return {};
+}
+
+// Why a call is not of the form that kernels of many phases are for.
+inline std::string why_not_many_phases(const PlanFacts& f) {
+  if (std::string reason = why_not_fused_law(f); !reason.empty()) return reason;
+  if (f.flips) return "FLIP needs the velocities before the forces";
+  if (!f.apic) return "the transfer is not APIC";
+  if (f.mirrors) return "mirrors read nodes of other blocks";
+  if (f.impulses) return "impulses are summed up";
+  return {};
+}
+
+// Why P2G cannot move F or J for the G2P before it.
+inline std::string why_not_late(const PlanFacts& f) {
+  if (std::string reason = why_not_many_phases(f); !reason.empty()) return reason;
+  if (f.gradients) return "gradients are wanted";
+  if (f.deterministic && !sums_are_fixed(f)) return "deterministic sums have an order where scenes have their own dt";
+  if (!f.one_deformation) return "both F and J move";
+  return {};
+}
+
+inline std::string count(int64_t value, const char* what) { return std::to_string(value) + " " + what; }
+
+inline std::string nothing(const PlanFacts&) { return {}; }
+
+namespace block_per_scene {
+inline std::string unsupported(const PlanFacts& f) {
+  if (std::string reason = why_not_fused_law(f); !reason.empty()) return reason;
+  if (f.flips) return "FLIP needs the velocities before the forces";
+  if (f.mirrors) return "mirrors read nodes of other blocks";
+  if (f.impulses) return "impulses are summed up";
+  if (f.gradients) return "gradients are wanted";
+  if (f.particles == 0) return "there are no particles";
+  if (f.steps < kLeastResidentSteps) return "a call has fewer than " + count(kLeastResidentSteps, "steps");
+  const int64_t most = f.dim == 2 ? kMostResidentParticles<2> : kMostResidentParticles<3>;
+  if (f.particles > most * f.scenes) return "scenes have more than " + count(most, "particles on average");
+  if (f.blocks_per_scene > kMostResidentBlocks) return "a domain has more than " + count(kMostResidentBlocks, "blocks");
+  return {};
+}
+inline std::string unprofitable(const PlanFacts& f) {
+  if (f.deterministic && !sums_are_fixed(f)) return {};
+  const bool pays = f.dim == 2 ? resident_pays<2>(f.particles, f.scenes) : resident_pays<3>(f.particles, f.scenes);
+  return pays ? "" : "kernels of whole grids are faster for scenes of this number and size";
+}
+}  // namespace block_per_scene
+
+namespace fused_g2p2g {
+inline std::string unsupported(const PlanFacts& f) {
+  if (std::string reason = why_not_late(f); !reason.empty()) return reason;
+  if (f.scene_ids) return "particles have the number of a scene";
+  if (!f.uniform_parameters) return "a parameter has more than one value";
+  if (f.particles == 0) return "there are no particles";
+  if (f.particles > INT32_MAX / 2) return "there are more than 2^30 particles";
+  if (f.steps < kLeastMergedSteps) return "a call has fewer than " + count(kLeastMergedSteps, "steps");
+  return {};
+}
+inline std::string unprofitable(const PlanFacts& f) {
+  return f.particles < kLeastMergedParticles ? "there are fewer than " + count(kLeastMergedParticles, "particles") : "";
+}
+}  // namespace fused_g2p2g
+
+namespace persistent {
+inline std::string unsupported(const PlanFacts& f) {
+  if (std::string reason = why_not_late(f); !reason.empty()) return reason;
+  if (f.particles == 0) return "there are no particles";
+  if (f.particles > kMostPersistentParticles)
+    return "there are more than " + count(kMostPersistentParticles, "particles");
+  if (f.steps < kLeastPersistentSteps) return "a call has fewer than " + count(kLeastPersistentSteps, "steps");
+  if (f.captured) return "the stream is recorded into a CUDA graph";
+  if (!f.graph_loops) return "the device runs no CUDA graphs with loops";
+  return {};
+}
+// It pays where one wave of thread blocks is enough for all items, as where the pool is small; one that grows and has
+// room for all blocks is meant for it (`pool_for`). Of deterministic grids this must not depend on how far a pool has
+// grown that was not meant for it.
+inline std::string unprofitable(const PlanFacts& f) {
+  if (f.grows && f.max_blocks < 0) return "the size of the pool is not known before the first activation";
+  if (f.grows && f.max_blocks != f.blocks()) return "the pool has no room for all blocks of the domain";
+  if (!f.grows && f.max_blocks > kMostPersistentBlocks)
+    return "the pool has more than " + count(kMostPersistentBlocks, "blocks");
+  const int64_t most = kMostPersistentParticles / (f.grows && !f.deterministic ? 1 : 2);
+  return f.particles > most ? "there are more than " + count(most, "particles") : "";
+}
+}  // namespace persistent
+
+namespace sorted_cpu {
+inline std::string unsupported(const PlanFacts& f) {
+  if (f.cuda) return "the particles are on a CUDA device";
+  return f.records ? "each step is recorded for its gradient" : "";
+}
+inline std::string unprofitable(const PlanFacts& f) { return f.steps < 2 ? "there is no step after the first" : ""; }
+}  // namespace sorted_cpu
+
+// In the order in which they are tried, but for the first, which serves every call.
+constexpr ScheduleEntry kSchedules[] = {
+    {kPerStep, "per_step", nothing, nothing},
+    {kFusedG2P2G, "fused_g2p2g", fused_g2p2g::unsupported, fused_g2p2g::unprofitable},
+    {kPersistent, "persistent", persistent::unsupported, persistent::unprofitable},
+    {kBlockPerScene, "block_per_scene", block_per_scene::unsupported, block_per_scene::unprofitable},
+    {kSortedCpu, "sorted_cpu", sorted_cpu::unsupported, sorted_cpu::unprofitable},
+};
+constexpr Schedule kOrderOfChoice[] = {kBlockPerScene, kFusedG2P2G, kPersistent, kSortedCpu};
+
+// The schedule of a call with the pool of `facts`.
+inline Schedule choose_schedule(const PlanFacts& facts) {
+  for (const Schedule s : kOrderOfChoice)
+    if (kSchedules[s].unsupported(facts).empty() && kSchedules[s].unprofitable(facts).empty()) return s;
+  return kPerStep;
+}
+
+// ---- pools
+
+struct PlannedPool {
+  int64_t blocks;  // for which the pool has room at least, or -1: it follows the scene, or is the one that was given
+  int64_t steps;   // of a call at most
+};
+
+// Whether the persistent kernel takes the steps if the pool has room for all blocks.
+inline bool takes_few_blocks(const PlanFacts& f) {
+  if (f.blocks() > kFewBlocks || !why_not_many_phases(f).empty() || f.steps < kLeastPersistentSteps) return false;
+  if (f.particles > kMostPersistentParticles) return false;
+  if (f.deterministic || f.max_blocks < 0) return f.deterministic && f.particles <= kMostPersistentParticles / 2;
+  return items_of_step(f, f.max_blocks) <= (f.dim == 2 ? kFewItems<2> : kFewItems<3>);
+}
+
+// The pool of a call, and its steps. Nobody looks whether a pool must grow that has room for all blocks of the domain:
+// where there are few, and a kernel takes many steps of few particles, or where many particles take more memory. A pool
+// that they leave room for is looked at less often, if steps do not pass over all of it. Of deterministic grids nothing
+// depends on how many blocks they have had, or a second run would not be the first one bit by bit.
+inline PlannedPool pool_for(const PlanFacts& f) {
+  if (!f.cuda) return {-1, kMostSteps};
+  if (!f.grows) {
+    const int64_t most = kWorkOfCall / std::max(f.particles, kLeastParticlesOfCall);
+    return {-1, std::clamp(most, kLeastStepsOfCall, kMostSteps)};
+  }
+  if (f.gradients) return {-1, kGrowingSteps};
+  const int64_t room = f.particles >= kLeastMergedParticles ? f.particles / kParticlesPerBlock : 0;
+  if (room >= f.blocks() || takes_few_blocks(f)) return {f.blocks(), kWholeSteps};
+  const bool passes = f.deterministic || f.mirrors || f.flips;
+  const int64_t times = f.max_blocks < 0 || passes ? 0 : room / std::max<int64_t>(kRoomy * f.max_blocks, 1);
+  if (times > 0) return {room, kRoomySteps * std::min<int64_t>(times, 2)};
+  return {-1, kGrowingSteps};
+}
+
+// What is done about particles that nobody has sorted, where it is worth it.
+enum Order : int64_t {
+  kAsGiven,
+  kSortedBefore,  // sorted before the call, and put back after it
+  kSortedByCall   // by the schedule
+};
+
+inline Order order_for(const PlanFacts& f) {
+  if (!f.cuda || f.captured || f.sorted || f.steps < kLeastSortedSteps || f.particles < kLeastSortedParticles)
+    return kAsGiven;
+  const bool itself = f.particles >= kLeastMergedParticles && !f.scene_ids && !f.gradients;
+  return itself && why_not_many_phases(f).empty() ? kSortedByCall : kSortedBefore;
+}
+
+}  // namespace mpm

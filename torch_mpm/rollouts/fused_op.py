@@ -1,0 +1,206 @@
+"""Calls of the fused op: many steps of a `Step` of compiled parts."""
+
+from __future__ import annotations
+
+import contextlib
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..checkpoints import binomial, offloaded
+from ..errors import check_count, check_flag, shape_of
+from ..laws.calls import law_calls
+from ..ops.autograd import dispatch
+from ..ops.contact import obstacle_arguments
+from ..ops.grid_update import per_scene, wall_arguments
+from ..ops.substeps import ARGUMENTS
+from ..ops.transfer import STRESS_FORMS
+from ..orders import STEPS_IN_ORDER, put_back, put_in_order
+from ..parameters import Overlay
+from ..pause import paused
+from ..signals import interruptible
+from ..state import State, check_state
+from ..step import Step
+from ..step_times import StepTimes, clocks, requires_grad, time_after
+from ..topology import Status
+from .plan import SCHEDULES, RolloutPlan, differentiates, follows_paths, why_not_fused
+
+
+def in_calls(step: Step, state: State, n: int, dt: float | Tensor, plan: RolloutPlan) -> State:
+    """The state n steps later, by calls of the fused op as planned. The op recomputes steps for the backward pass
+    where it may not store all that their gradient needs."""
+    assert plan.facts is not None
+    with_gradient, kept = plan.facts.gradients, plan.checkpoints
+    if plan.sorts:
+        return _in_order(step, step.prepare(state), n, dt, plan)
+    schedule = plan.schedule if plan.forced else None
+
+    def advance(state: State, count: int, first: int = 0) -> State:
+        while count > 0:
+            call = plan.call(count, step.grid.max_blocks)
+            now = min(count, plan.steps_per_call) if with_gradient else call.steps
+            state = substeps(step, state, now, dt, plan.stores_all, call.max_blocks, schedule)
+            count -= now
+        return state
+
+    if not with_gradient or plan.stores_all:
+        return advance(state, n)
+    if kept is not None and kept.states is not None and n > 0:
+        return binomial(advance, step.prepare(state), n, kept.states, step)
+    with offloaded(state) if kept is not None and kept.offload else contextlib.nullcontext():
+        return advance(state, n)
+
+
+def _in_order(step: Step, given: State, n: int, dt: float | Tensor, plan: RolloutPlan) -> State:
+    """`in_calls` of particles that are sorted now and then, and put back."""
+    assert plan.facts is not None
+    most = n if plan.facts.gradients else STEPS_IN_ORDER
+    plan = plan.of_sorted()
+    end = given
+    for first in range(0, n, most):
+        start = put_in_order(step, end)
+        end = in_calls(step, start, min(most, n - first), dt, plan)
+    return put_back(step, end, start, given)
+
+
+def substeps(
+    step: Step,
+    state: State,
+    n: int,
+    dt: float | Tensor,
+    records: bool = False,
+    blocks: int | None = None,
+    schedule: str | None = None,
+) -> State:
+    """The state n steps later, by one call of the op; `why_not_fused` must be None. It `records` what gradients need,
+    if it has any, or recomputes the steps. The pool has room for `blocks` at least, or for those of the grid.
+
+    Raises:
+        ValueError: for a dt that is not positive and finite, or a material without a law.
+        GridOverflowError: on the CPU, where a grid of fixed `max_blocks` is full.
+    """
+
+    def advanced(state: State, dt: float | Tensor) -> State:
+        return _substeps(step, state, n, dt, records, blocks, schedule)
+
+    return paused(advanced, step._activations, step.prepare(state), dt, step.grid.scenes, n)
+
+
+def substeps_arguments(
+    step: Step, state: State, n: int, dt: float | Tensor, records: bool = False, blocks: int | None = None
+) -> dict[str, Any]:
+    """The arguments of `torch.ops.torch_mpm.substeps` by name, for training code that calls the op itself.
+
+    The op knows no paused scenes: each entry of a tensor dt must be positive. `Step.check` does not see its steps; its
+    status is the one after them, for which `previous_status` is the one before.
+
+    Args:
+        step, state, n, dt: as `rollout`; n at most 65536.
+        records: whether the op keeps what gradients need, or its backward pass takes the steps again.
+        blocks: for which the pool has room; None for as many as the grid has now, which on CUDA must be enough for all
+            steps.
+
+    Raises:
+        ValueError: where the op cannot take the steps, and why.
+    """
+    if not isinstance(step, Step):
+        raise TypeError(f"step must be a Step, got {shape_of(step)}")
+    check_count("n", n, 1)
+    check_flag("records", records)
+    if blocks is not None:
+        check_count("blocks", blocks)
+    check_state(state)
+    if (reason := why_not_fused(step, state, dt)) is not None:
+        raise ValueError(f"step must be one that `substeps` can take, got one of which {reason}")
+    return _arguments(step, step.with_residual(step.prepare(state), dt), n, dt, records, blocks)[0]
+
+
+def _arguments(
+    step: Step,
+    state: State,
+    n: int,
+    dt: float | Tensor,
+    records: bool,
+    blocks: int | None,
+    schedule: str | None = None,
+) -> tuple[dict[str, Any], list[list[str]]]:
+    """Those of the op, in its order, and the names of the history of each law; of a prepared state."""
+    grid = step.grid
+    number, scene_dt, scene_time = clocks(state, dt, grid.scenes)
+    times = StepTimes.of(state, n, dt, grid.scenes) if follows_paths(step) else None
+    pool = grid.pool(state.x, state.scene)
+    step.law.check_parameters(len(state), grid.scenes)
+    given: Any = Overlay(state, dt=dt)
+    calls = law_calls(step.law, given)
+    apic = step.transfer == "apic"
+    table, *others = obstacle_arguments(step.boundaries.entries, state.x, grid.scenes, times)
+    of_table = table is not None and table.requires_grad
+    with_gradient = torch.is_grad_enabled() and (of_table or differentiates(step, state, dt))
+    arguments = (
+        *(state.x, state.v, state.mass, state.volume, state.C, state.F, state.J),
+        None if state.x_residual is None else state.x_residual.detach(),
+        *(calls.history, state.scene, state.ids, calls.material, step._activations.status_for(state.x)),
+        *(calls.names, calls.options, calls.parameters, calls.variables),
+        *(int(n), number, apic, step._flip_share, apic or step.law.viscous, STRESS_FORMS[step.stress_form]),
+        _gravity(step, state.x),
+        *wall_arguments(step.walls, grid),
+        *(table, *others),
+        *(0.0 if scene_time is not None else float(state.time), grid.scenes),
+        *(pool if blocks is None else max(pool, blocks), grid.grows, not with_gradient, with_gradient and records),
+        *(state.impulse, scene_dt, scene_time, *grid.packed),
+        -1 if schedule is None else SCHEDULES.index(schedule),
+    )
+    return dict(zip(ARGUMENTS, arguments, strict=True)), calls.history_names
+
+
+def _substeps(
+    step: Step, state: State, n: int, dt: float | Tensor, records: bool, blocks: int | None, schedule: str | None
+) -> State:
+    """`substeps` of a prepared state, where no scene is paused."""
+    grid, record = step.grid, step._activations
+    record.begin(state, grid.scenes)
+    arguments, history_names = _arguments(step, state, n, dt, records, blocks, schedule)
+    x, v, C, F, J, history, status, impulse, time, residual, _ = interruptible(
+        dispatch, torch.ops.torch_mpm.substeps, *arguments.values()
+    )
+    record.follow(record.status, status)
+    grid.watch(status)
+    if status.device.type == "cpu":  # where the op has let the pool grow, or stopped
+        grid.follow(int(status[0, Status.BLOCKS_WANTED if grid.grows else Status.BLOCKS_NOW]))
+    extra = _history(state, history_names, history)
+    now = time_after(state.time, dt, n) if time is None else _in_shape(time.detach(), state.time, dt)
+    if requires_grad(dt) or requires_grad(state.time):
+        known: Any = state.time + n * (dt.double() if isinstance(dt, Tensor) else dt)
+        now = now + (known - known.detach())  # which has the gradient
+    residual = None if residual is None else residual.detach()
+    return state.replace(x=x, v=v, C=C, F=F, J=J, extra=extra, time=now, impulse=impulse, x_residual=residual)
+
+
+def _in_shape(times: Tensor, time: float | Tensor, dt: float | Tensor) -> Tensor:
+    """Times of each scene as the sum of a time and dt has them: one where all have the same."""
+    shape = max((tuple(t.shape) for t in (time, dt) if isinstance(t, Tensor)), key=lambda s: (len(s), s))
+    return times if times.shape == shape or not len(times) else times[:1].reshape(shape)
+
+
+def _gravity(step: Step, x: Tensor) -> Tensor | None:
+    gravity = step.gravity_like(x)
+    return None if gravity is None else per_scene(gravity, x, step.grid.scenes, step.grid.dim)
+
+
+def _history(state: State, names: list[list[str]], columns: Tensor | None) -> dict[str, Tensor]:
+    """The history of all laws by name; each particle has that of its law."""
+    extra, first = dict(state.extra), 0
+    for number, own_names in enumerate(names):
+        for name in own_names:
+            before = extra[name]
+            width = 1 if before.dim() == 1 else before.shape[1] ** 2
+            assert columns is not None
+            value = columns[:, first] if before.dim() == 1 else columns[:, first : first + width].view_as(before)
+            if len(names) > 1:
+                assert state.material is not None
+                own = (state.material == number).reshape(-1, *(1,) * (before.dim() - 1))
+                value = torch.where(own, value, before)
+            extra[name] = value
+            first += width
+    return extra

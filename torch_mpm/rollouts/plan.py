@@ -1,0 +1,506 @@
+"""Which way a rollout goes: decided once, before it starts, as a value."""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from .. import captured_steps
+from .._library import graph_loops
+from ..activation_record import ActivationRecord
+from ..anomaly import detecting
+from ..boundaries import Obstacle
+from ..boundaries.obstacles import motion_tensors
+from ..capture import NUMBERS, GraphCache, Recordings, is_captured, is_of_library, is_traced, is_transformed
+from ..checkpoints import Checkpoints, as_checkpoints
+from ..errors import check_count, shape_of
+from ..graphs import LEAST_STEPS, tensors_of
+from ..grid import Grid
+from ..laws import CompiledLaw
+from ..laws.active import Active
+from ..laws.calls import laws_of, passive
+from ..laws.custom import CustomLaw
+from ..ops.arguments import check_choice
+from ..ops.contact import MAX_OBSTACLES, fusible
+from ..ops.obstacle_tables import numbers_of_a_step, path_requires_grad
+from ..parameters import has_hooks
+from ..state import State, check_state
+from ..step import Step
+from ..step_times import StepTimes, requires_grad
+from .budget import EVERYTHING, resolved, steps_of_a_call
+
+Executor = Literal["fused", "replay", "graph", "loop"]
+SCHEDULES = ("per_step", "fused_g2p2g", "persistent", "block_per_scene", "sorted_cpu")
+"""Of the fused op, in the order of csrc/rollout/plan.h."""
+_WORDS = {
+    "fused": "all steps in one op",
+    "replay": "from a CUDA graph of one step",
+    "graph": "from CUDA graphs",
+    "loop": "step by step",
+}
+
+
+class Facts(NamedTuple):
+    """What the choice of a schedule depends on: the arguments of `torch.ops.torch_mpm.plan_substeps` after the first,
+    which are explained in csrc/rollout/plan.h."""
+
+    cuda: bool
+    float32: bool
+    dim: int
+    particles: int
+    scenes: int
+    steps: int
+    blocks_per_scene: int
+    max_blocks: int
+    grows: bool
+    deterministic: bool
+    quadratic: bool
+    apic: bool
+    flips: bool
+    mls: bool
+    mirrors: bool
+    impulses: bool
+    clocks: bool
+    scene_ids: bool
+    sorted: bool
+    laws: int
+    materials: bool
+    additive: bool
+    uniform_parameters: bool
+    one_deformation: bool
+    gradients: bool
+    records: bool
+    captured: bool
+    graph_loops: bool
+    path_bytes: int
+
+
+class CallPlan(NamedTuple):
+    """The plan of one call of the fused op."""
+
+    schedule: str
+    max_blocks: int | None
+    """Blocks for which its pool has room at least; None for those of the grid."""
+    steps: int
+    """At most."""
+    order: int
+    """Of particles that nobody has sorted: 0 as given; 1 sorted before the call and put back after it; 2 sorted by the
+    schedule itself."""
+    reasons: tuple[tuple[str, str], ...]
+    """Why each other schedule was not chosen."""
+
+
+@functools.lru_cache(maxsize=1024)
+def plan_call(schedule: str | None, facts: Facts) -> CallPlan:
+    """The plan of the next call of the fused op.
+
+    Raises:
+        RuntimeError: for a schedule that cannot take the steps.
+    """
+    number = -1 if schedule is None else SCHEDULES.index(schedule)
+    chosen, blocks, steps, order, reasons = torch.ops.torch_mpm.plan_substeps(number, *facts)
+    against = tuple(tuple(line.split(": ", 1)) for line in reasons.splitlines())
+    return CallPlan(SCHEDULES[chosen], None if blocks < 0 else blocks, steps, order, against)
+
+
+@dataclasses.dataclass(frozen=True)
+class RolloutPlan:
+    """Which way a rollout goes, and why not another one; `str` gives it in words.
+
+    Attributes:
+        executor: "fused" for calls of one op; "replay" for replays of a CUDA graph of one step; "graph" for CUDA graphs
+            of some steps with their gradients (`rollout(graph=)`); "loop" for steps from Python.
+        schedule: of the first call of the fused op, see docs/architecture.md; None for other executors.
+        steps_per_call: steps of a call of the op, or of a graph, at most.
+        max_blocks: blocks for which the pool of the first call has room at least; None for those of the grid.
+        sorts: whether particles are sorted before the steps, and put back after them.
+        checkpoints: which states are stored for the backward pass; None for those of the fused op itself, or for all.
+            `Checkpoints(memory=...)` has become the number of states that fits.
+        reasons: why each other executor and schedule was not chosen, by name.
+        forced: whether the schedule was given. Otherwise each call chooses in the same way.
+        facts: what the schedule of the first call depends on; None for other executors.
+    """
+
+    executor: Executor
+    schedule: str | None
+    steps_per_call: int
+    max_blocks: int | None
+    sorts: bool
+    checkpoints: Checkpoints | None
+    reasons: dict[str, str]
+    forced: bool = False
+    facts: Facts | None = dataclasses.field(default=None, repr=False, compare=False)
+
+    @property
+    def stores_all(self) -> bool:
+        """Whether all that the backward pass needs is stored, and no step is recomputed."""
+        return self.checkpoints is EVERYTHING
+
+    def call(self, n: int, max_blocks: int | None) -> CallPlan:
+        """The plan of a call with n steps left, from a pool of `max_blocks`."""
+        facts, blocks = self.facts, -1 if max_blocks is None else max_blocks
+        assert facts is not None
+        if facts.steps != n or facts.max_blocks != blocks:
+            facts = facts._replace(steps=n, max_blocks=blocks)
+        return plan_call(self.schedule if self.forced else None, facts)
+
+    def of_sorted(self) -> RolloutPlan:
+        """The plan for particles that were sorted."""
+        assert self.facts is not None
+        return dataclasses.replace(self, sorts=False, facts=self.facts._replace(sorted=True))
+
+    def headline(self) -> str:
+        """Executor and schedule in words."""
+        words = _WORDS[self.executor]
+        if self.executor == "fused":
+            assert self.facts is not None
+            words = "all steps between two kept states in one op" if self.facts.gradients else words
+            return f"{words}, by schedule {self.schedule}"
+        if self.executor == "graph":
+            words += f" of {self.steps_per_call} steps"
+        return f"{words}, because {self.reasons['fused']}"
+
+    def __str__(self) -> str:
+        others = [f"not {name}: {reason}" for name, reason in self.reasons.items()]
+        return "\n".join([self.headline(), *others])
+
+
+def plan_rollout(
+    step: Callable[[State, float | Tensor], State],
+    state: State,
+    n: int,
+    dt: float | Tensor,
+    *,
+    checkpoint: int | Checkpoints | None = None,
+    graph: int | None = None,
+    schedule: str | None = None,
+) -> RolloutPlan:
+    """Which way `rollout` with these arguments goes, and why not another one.
+
+    No step is taken, but for one aside where a budget of memory is to be shared out over steps from Python. Nothing is
+    changed, and the device is not waited for.
+
+    Args:
+        step, state, n, dt, checkpoint, graph: as `rollout`.
+        schedule: the schedule of the fused op: "per_step", "fused_g2p2g", "persistent", "block_per_scene" or
+            "sorted_cpu" (docs/architecture.md). None: the fastest one.
+
+    Raises:
+        TypeError, ValueError: for a wrong argument, and for a schedule that cannot take the steps, with the reason.
+    """
+    if not callable(step):
+        raise TypeError(f"step must be a Step or a function (state, dt) -> state, got {shape_of(step)}")
+    check_count("n", n)
+    if graph is not None:
+        check_count("graph", graph, 1)
+    kept = as_checkpoints(checkpoint)
+    check_state(state)
+    return plan_of_steps(step, state, n, dt, kept, graph, schedule)
+
+
+def plan_of_steps(
+    step: Callable[[State, float | Tensor], State],
+    state: State,
+    n: int,
+    dt: float | Tensor,
+    checkpoints: Checkpoints | None = None,
+    graph: int | None = None,
+    schedule: str | None = None,
+) -> RolloutPlan:
+    """`plan_rollout` for arguments that were checked."""
+    if schedule is not None:
+        check_choice("schedule", schedule, SCHEDULES)
+    no_op = why_not_fused(step, state, dt)
+    if checkpoints is not None:
+        checkpoints = _that_fit(checkpoints, step, state, n, dt, no_op is None)
+    if no_op is None:
+        return _fused(step, state, n, dt, checkpoints, schedule)  # type: ignore[arg-type]
+    if schedule is not None:
+        raise ValueError(f"schedule must be None where steps are not taken in one op, got {schedule!r}: {no_op}")
+    reasons = {"fused": no_op}
+    no_replay = _why_not_replay(step, state, n, dt)
+    if no_replay is None:
+        reasons |= {"graph": "replays of one step need nothing of the user's", "loop": "a graph is faster"}
+        return RolloutPlan("replay", None, 1, None, False, checkpoints, reasons)
+    reasons["replay"] = no_replay
+    no_graph = _why_not_graphs(step, state, dt)
+    if no_graph is None and graph is not None:
+        reasons["loop"] = "graphs are faster"
+        return RolloutPlan("graph", None, max(min(graph, n), 1), None, False, checkpoints, reasons)
+    reasons["graph"] = no_graph or "rollout(graph=...) takes some steps from a graph"
+    return RolloutPlan("loop", None, 1, None, False, checkpoints, reasons)
+
+
+def _that_fit(
+    checkpoints: Checkpoints, step: Any, state: State, n: int, dt: float | Tensor, fused: bool
+) -> Checkpoints | None:
+    """Checkpoints without a budget of memory; `EVERYTHING` where all steps fit, None where nothing is stored."""
+    if not torch.is_grad_enabled():
+        return None
+    if checkpoints.memory is None or checkpoints is EVERYTHING:
+        return checkpoints
+    return resolved(checkpoints, step, state, n, dt, fused) or EVERYTHING
+
+
+_INSTEAD = {name: "the op takes all steps" for name in ("replay", "graph", "loop")}
+
+
+def _fused(
+    step: Step, state: State, n: int, dt: float | Tensor, checkpoints: Checkpoints | None, schedule: str | None
+) -> RolloutPlan:
+    facts = facts_of(step, state, n, dt, checkpoints is EVERYTHING)
+    try:
+        call = plan_call(schedule, facts)
+    except RuntimeError as error:
+        raise ValueError(str(error).partition("\n")[0]) from None
+    steps = call.steps
+    if facts.gradients and checkpoints is not EVERYTHING:
+        every = None if checkpoints is None else checkpoints.every
+        steps = min(steps, every or steps_of_a_call(state, n))
+    reasons = {**_INSTEAD, **dict(call.reasons)}
+    forced = schedule is not None
+    return RolloutPlan(
+        "fused", call.schedule, steps, call.max_blocks, call.order == 1, checkpoints, reasons, forced, facts
+    )
+
+
+# ---- why not
+
+
+def why_not_fused(step: Any, state: State, dt: float | Tensor) -> str | None:
+    """Why the fused op cannot take the steps from a state; None where it can."""
+    if type(step) is not Step:
+        return f"{type(step).__name__} may do more than a Step" if isinstance(step, Step) else "it is no Step"
+    x, law = state.x, step.law
+    for name, value in (("dt", dt), ("the time of the state", state.time)):
+        if requires_grad(value) and (step._flip_share or step.boundaries.reads_time):
+            return f"{name} requires a gradient, with FLIP or boundaries that may read the time"
+    if isinstance(dt, Tensor) and dt.dtype != x.dtype:
+        return f"dt is a tensor, but not in {str(x.dtype).removeprefix('torch.')}"
+    if (reason := _why_not_eager(x)) is not None:
+        return reason
+    if step.heat is not None:
+        return "it conducts heat"
+    if step.integrator is not None:
+        return "it is implicit"
+    if step.on_grid is not None:
+        return "it calls on_grid"
+    if step.on_particles is not None:
+        return "it calls on_particles"
+    if step._flip_share and state.impulse is not None and has_mirrors(step):
+        return "FLIP keeps a share of the impulses on mirrors"
+    laws = [passive(part) for part in laws_of(law)]
+    for part in laws:
+        if not isinstance(part, CompiledLaw) or not part.is_all_of_its_update() or type(part).forward is not _FORWARD:
+            return f"{type(part).__name__} is more than a compiled law"
+    if any(has_hooks(module) for module in (step, *law.modules())):
+        return "there are hooks"
+    boundaries = step.boundaries.entries
+    if not all(isinstance(b, Obstacle) and fusible(b, 0.0, paths=True) for b in boundaries):
+        return "a boundary acts by torch operations"
+    if len(boundaries) > MAX_OBSTACLES:
+        return f"there are more than {MAX_OBSTACLES} obstacles"
+    if torch.is_grad_enabled() and any(part.has_functions for part in laws):
+        return "a parameter is a function, which may have a gradient"
+    return None
+
+
+_FORWARD = CompiledLaw.forward
+
+
+def _why_not_eager(x: Tensor) -> str | None:
+    """Why steps from a position must be those of Python, which others look at."""
+    if torch.compiler.is_compiling() or is_traced(x) or is_captured(x) or is_transformed():
+        return "it is compiled, captured or transformed"
+    return "anomaly detection looks at every step" if detecting() else None
+
+
+def _why_no_graph(step: nn.Module, state: State, dt: float | Tensor) -> str | None:
+    """Why no CUDA graph can have the steps."""
+    if isinstance(dt, Tensor):
+        return "dt is a tensor"
+    if (reason := _why_not_eager(state.x)) is not None:
+        return reason
+    if any(has_hooks(module) for module in step.modules()):
+        return "there are hooks"
+    steps = [module for module in step.modules() if isinstance(module, Step)]
+    if any(part.integrator is not None for part in steps):
+        return "an implicit step waits for its solve"
+    if any(part.heat is not None and part.heat.method == "multigrid" for part in steps):
+        return "multigrid does all of its iterations in a graph"
+    return None
+
+
+def _why_not_replay(step: Any, state: State, n: int, dt: float | Tensor) -> str | None:
+    """Why `replayed` cannot take the steps from a state; None where it can. What the library does not know stays in
+    Python: a function may count its calls, or look at the time."""
+    if type(step) is not Step:
+        return "it is not a plain Step"
+    if not state.x.is_cuda:
+        return "there are no graphs on the CPU"
+    if (reason := _why_no_graph(step, state, dt)) is not None:
+        return reason
+    if isinstance(state.time, Tensor):
+        return "the time of the state is a tensor"
+    if torch.is_grad_enabled() and any(t.requires_grad for t in (*tensors_of(state).values(), *_all_of(step))):
+        return "it is differentiated"
+    if (reason := _foreign(step, state.x.device, [])) is not None:
+        return reason
+    return f"there are no more than {LEAST_STEPS} steps" if n <= LEAST_STEPS else None
+
+
+def _why_not_graphs(step: Any, state: State, dt: float | Tensor) -> str | None:
+    """Why `in_graphs` cannot take the steps from a state; None where it can."""
+    if not isinstance(step, nn.Module):
+        return "it is no module"
+    if not captured_steps.has_graphs(state.x.device):
+        return "there are no graphs on the CPU"
+    if (reason := _why_no_graph(step, state, dt)) is not None:
+        return reason
+    if (place := captured_steps.another_device(step, state.x.device)) is not None:
+        return f"a tensor of it is on {place}, the particles on {state.x.device}"
+    return "there are no particles" if len(state) == 0 else None
+
+
+_OWN = (GraphCache, Recordings, ActivationRecord, Grid)
+"""Made for graphs."""
+
+
+def _foreign(part: Any, device: torch.device, seen: list[Any]) -> str | None:
+    """What a step, or a part of it, has of the user's, or on another device; None for nothing."""
+    if part is None or isinstance(part, NUMBERS) or type(part) in _OWN or any(part is known for known in seen):
+        return None
+    if isinstance(part, Tensor):
+        return None if part.device == device else f"a tensor of it is on {part.device}, the particles on {device}"
+    seen.append(part)
+    if type(part) in (dict, collections.OrderedDict):
+        members = list(part.values())
+    elif type(part) in (list, tuple, set) or (_is_known(part) and isinstance(part, tuple)):
+        members = list(part)
+    elif _is_known(part):
+        members = list(vars(part).values())
+    else:
+        return f"it has something of the user's, {shape_of(part)}"
+    return next(filter(None, (_foreign(member, device, seen) for member in members)), None)
+
+
+def _is_known(part: Any) -> bool:
+    known = is_of_library(type(part)) or type(part) in (nn.ModuleList, nn.ModuleDict)
+    return known and not isinstance(part, CustomLaw)
+
+
+def _all_of(step: Step) -> list[Tensor]:
+    gravity = [step.gravity] if isinstance(step.gravity, Tensor) else []
+    return [*gravity, *step.parameters(), *step.buffers()]
+
+
+# ---- facts of the fused op
+
+
+def facts_of(step: Step, state: State, n: int, dt: float | Tensor, stores_all: bool = False) -> Facts:
+    """Those of n steps, in one op if possible."""
+    x, grid = state.x, step.grid
+    laws, moved = laws_of(step.law), step.law.state_fields
+    gradients = wants_gradient(step, state, n, dt)
+    return Facts(
+        x.is_cuda,
+        x.dtype == torch.float32,
+        grid.dim,
+        len(state),
+        grid.scenes,
+        n,
+        grid.block_count // max(grid.scenes, 1),
+        -1 if grid.max_blocks is None else grid.max_blocks,
+        grid.grows,
+        grid.deterministic,
+        grid.kernel == "quadratic",
+        step.transfer == "apic",
+        step._flip_share > 0,
+        step.stress_form == "mls",
+        has_mirrors(step),
+        state.impulse is not None,
+        isinstance(dt, Tensor) or isinstance(state.time, Tensor),
+        state.scene is not None,
+        state.ids is not None,
+        sum(2 if isinstance(part, Active) else 1 for part in laws),
+        len(laws) > 1,
+        False,
+        not x.is_cuda or _is_uniform(laws[0]),
+        (state.F is not None or "F" in moved) != (state.J is not None or "J" in moved),
+        gradients,
+        gradients and stores_all and state.impulse is None and len(state) > 0,
+        is_captured(x),
+        x.is_cuda and graph_loops(),
+        _path_bytes(step, state, dt) if step.boundaries.entries else 0,
+    )
+
+
+def _is_uniform(law: Any) -> bool:
+    """Whether each parameter of a compiled law has one value for all particles."""
+    part = passive(law)
+    values = part.values() if isinstance(part, CompiledLaw) else [part.forward]
+    return all(v.numel() == 1 if isinstance(v, Tensor) else not callable(v) for v in values)
+
+
+def _path_bytes(step: Step, state: State, dt: float | Tensor) -> int:
+    """Of the table of obstacles on paths, in a step [bytes]; zero without such obstacles."""
+    if not follows_paths(step):
+        return 0
+    clocks_of_scenes = isinstance(dt, Tensor) or isinstance(state.time, Tensor)
+    numbers = numbers_of_a_step(_obstacles(step), state.x, step.grid.scenes if clocks_of_scenes else 1)
+    return numbers * state.x.element_size()
+
+
+def has_mirrors(step: Step) -> bool:
+    """Whether some faces of the domain are mirrors, which read nodes of other blocks."""
+    return step.walls is not None and step.walls.mirrors() is not None
+
+
+def wants_gradient(step: Step, state: State, n: int = 1, dt: float | Tensor = 1.0) -> bool:
+    """Whether the fused op is differentiated. Functions of time are called at the first and the last of n steps."""
+    if not torch.is_grad_enabled():
+        return False
+    if differentiates(step, state, dt):
+        return True
+    if not follows_paths(step):
+        return False
+    times = StepTimes.of(state, n, dt, step.grid.scenes)
+    return any(path_requires_grad(b, state.x, times) for b in _obstacles(step) if b.follows_path)
+
+
+def differentiates(step: Step, state: State, dt: float | Tensor) -> bool:
+    """The same, whatever functions of time return."""
+    return requires_grad(dt) or any(t.requires_grad for t in _differentiable(step, state))
+
+
+def follows_paths(step: Step) -> bool:
+    """Whether the position of an obstacle is a function of time."""
+    return any(b.follows_path for b in _obstacles(step))
+
+
+def _obstacles(step: Step) -> list[Obstacle]:
+    return [b for b in step.boundaries.entries if isinstance(b, Obstacle)]
+
+
+def _differentiable(step: Step, state: State) -> list[Tensor]:
+    """What the fused op has gradients for."""
+    fields = (
+        state.x,
+        state.v,
+        state.mass,
+        state.volume,
+        state.C,
+        state.F,
+        state.J,
+        *state.extra.values(),
+        state.impulse,
+    )
+    gravity = [step.gravity] if isinstance(step.gravity, Tensor) else []
+    obstacles = [t for b in _obstacles(step) for t in motion_tensors(b)]
+    return [*(t for t in fields if t is not None), *gravity, *step.law.parameters(), *step.law.buffers(), *obstacles]

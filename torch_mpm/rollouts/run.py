@@ -1,0 +1,191 @@
+"""Many steps in a row: in one op where a step is all of compiled parts, otherwise from Python."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..anomaly import begin, detecting, watch
+from ..boundaries.control import control_step
+from ..captured_steps import in_graphs
+from ..checkpoints import Checkpoints, as_checkpoints, binomial, in_segments
+from ..errors import check_count, shape_of
+from ..gradient_norms import GradientNorms
+from ..graphs import replayed
+from ..ops.arguments import split_dt
+from ..rollout_parts import Hook, Parts
+from ..state import State, check_state
+from ..step import Step
+from .budget import EVERYTHING, resolved
+from .fused_op import in_calls
+from .plan import RolloutPlan, plan_of_steps, why_not_fused
+
+
+def rollout(
+    step: Callable[[State, float | Tensor], State],
+    state: State,
+    n: int,
+    dt: float | Tensor,
+    checkpoint: int | Checkpoints | None = None,
+    *,
+    prefix: int = 0,
+    truncate: int | None = None,
+    hook: Hook | None = None,
+    every: int = 1,
+    norms: GradientNorms | None = None,
+    graph: int | None = None,
+    schedule: str | None = None,
+    plan: RolloutPlan | None = None,
+) -> State:
+    """The state n steps later.
+
+    Args:
+        step: a `Step`, or any function (state, dt) -> state.
+        state: the initial state.
+        n: number of steps.
+        dt: time step [s], as `Step` takes it.
+        checkpoint: what is kept for the backward pass, which takes the steps between again: the state of every so many
+            steps (memory n/checkpoint + checkpoint states instead of n steps; sqrt(n) is best), or what `Checkpoints`
+            says: so many states, a budget of memory, states that wait on the host. None: all steps.
+        prefix: number of first steps that are taken without gradients.
+        truncate: if given, gradients pass back through so many steps at most: the graph is cut before the steps
+            n - truncate, n - 2 truncate, ... Without a hook that is a prefix of n - truncate steps.
+        hook: called as `hook(state, k)` before step k = 0, every, 2 every, ...; it may look at the state, add to a
+            loss, or return another state of as many particles. Where a hook acts a state is kept.
+        every: steps from one call of the hook to the next.
+        norms: records the norm of the gradient at states on the way; see `GradientNorms`.
+        graph: steps from Python, on CUDA, are replays of CUDA graphs of so many of them, functions of the user's among
+            them, and in the backward pass of these and of a graph of their gradients: for networks in a step, whose
+            kernels take the host longer than the device. The state of every `graph` steps is kept, and its steps are
+            taken again. See `captured` for what is recorded, and when anew; the step keeps the graphs for the next
+            rollout. It must be a `Step` or another module. On the CPU, and where `Step.explain` gives a reason against
+            it, steps are taken as without.
+        schedule: of steps in one op, see `plan_rollout`; None for the fastest one.
+        plan: the plan of `plan_rollout` for these steps, in place of `checkpoint`, `graph` and `schedule`. By default
+            the rollout makes it.
+
+    A `Step` of compiled laws without heat and functions of the user's takes all steps in one op, or some, with the
+    results of single steps; `Step.explain` tells. On CUDA they are the same to the last bit, but for float32 without
+    gradients, which like all of a CPU rounds differently, and for many particles that nobody has sorted (`state.ids` is
+    None), which are sorted for 64 steps and more, and put back; the status does not count blocks that are there only
+    between two activations. Its gradients take the steps again from kept states, those of every `checkpoint` steps,
+    sqrt(n) of them by default and more where states are small. A kept state of a solid has 2 D + 2 D² numbers per
+    particle (24 in 3-D, 96 bytes in float32) and its history; while the backward pass goes through `checkpoint` steps,
+    it holds about 2 D + 4 D² (42 in 3-D) for each of them, and half as much of the grid at most. Where all steps fit
+    into `Checkpoints(memory=...)` that is kept instead, and none is taken again. Second derivatives need single steps.
+    On CUDA and without gradients, other steps that call no function of the user's are replays of a CUDA graph of one;
+    see `captured` for what else there is, and `estimate_rollout` for what a rollout will take. Under
+    `torch.autograd.detect_anomaly` a gradient that is NaN is reported with its operation, substep and scene.
+
+    Raises:
+        TypeError, ValueError: for a number of steps that is no whole number or out of range, a schedule that cannot
+            take the steps, a plan that is not for them, or what `step` raises.
+    """
+    if not callable(step):
+        raise TypeError(f"step must be a Step or a function (state, dt) -> state, got {shape_of(step)}")
+    check_count("n", n)
+    kept = as_checkpoints(checkpoint)
+    if graph is not None:
+        check_count("graph", graph, 1)
+    if plan is not None:
+        if checkpoint is not None or graph is not None or schedule is not None:
+            raise ValueError("checkpoint, graph and schedule must be None with a plan, which has them")
+        kept, graph, schedule = _parts_of(plan)
+    if truncate is None and hook is None and norms is None and prefix == 0 and every == 1 and every is not True:
+        check_state(state)
+        with control_step(step, state, n, dt) as left:
+            return left(_taken(step, state, n, dt, kept, graph=graph, schedule=schedule, given=plan))
+    parts = Parts(n, prefix, truncate, hook, every, norms)
+    if isinstance(step, Step):
+        state = step.prepare(state)
+        split_dt(dt, step.grid.scenes, state.x)  # which checks it
+    if kept is not None and kept.memory is not None and torch.is_grad_enabled():  # the same for all parts
+        fused = why_not_fused(step, state, dt) is None
+        kept = resolved(kept, step, state, n - parts.first_with_gradient(), dt, fused) or EVERYTHING
+    grid = step.grid if isinstance(step, Step) else None
+    scales = (1, 1.0, dt) if grid is None else (grid.scenes, grid.dx, dt)
+
+    def advance(state: State, count: int, k: int) -> State:
+        return _taken(step, state, count, dt, kept, k, graph, schedule, plan)
+
+    return parts.run(advance, state, scales, lambda state, count: control_step(step, state, count, dt))
+
+
+def _parts_of(plan: RolloutPlan) -> tuple[Checkpoints | None, int | None, str | None]:
+    """Checkpoints, steps of a graph and the schedule that a plan was made for."""
+    if not isinstance(plan, RolloutPlan):
+        raise TypeError(f"plan must be a RolloutPlan or None, got {shape_of(plan)}")
+    graph = plan.steps_per_call if plan.executor == "graph" else None
+    return plan.checkpoints, graph, plan.schedule if plan.forced else None
+
+
+def _taken(
+    step: Callable[[State, float | Tensor], State],
+    state: State,
+    n: int,
+    dt: float | Tensor,
+    kept: Checkpoints | None = None,
+    first: int = 0,
+    graph: int | None = None,
+    schedule: str | None = None,
+    given: RolloutPlan | None = None,
+) -> State:
+    """The state n steps later, of which the first is step `first` of a rollout; by the plan of these steps, which must
+    have the executor of a given one."""
+    if isinstance(step, Step):
+        state = step.with_residual(state, dt)
+    plan = plan_of_steps(step, state, n, dt, kept, graph, schedule)
+    if given is not None and given.executor != plan.executor:
+        reason = plan.reasons.get(given.executor, "another executor takes them")
+        raise ValueError(f"plan must be one for these steps, got the executor {given.executor!r}: {reason}")
+    if plan.executor == "fused":
+        return in_calls(step, state, n, dt, plan)  # type: ignore[arg-type]
+    if plan.executor == "replay":
+        return replayed(step, state, n, dt)  # type: ignore[arg-type]
+    return _from_python(step, state, n, dt, plan, first)
+
+
+def _from_python(
+    step: Callable[[State, float | Tensor], State],
+    state: State,
+    n: int,
+    dt: float | Tensor,
+    plan: RolloutPlan,
+    first: int,
+) -> State:
+    """`_taken` by single steps, or by graphs of some."""
+    grid = step.grid if isinstance(step, Step) else None
+    kept = None if plan.stores_all else plan.checkpoints
+
+    def single(state: State, count: int, begins: int) -> State:
+        if plan.executor == "graph":
+            return in_graphs(step, state, count, dt, plan.steps_per_call)  # type: ignore[arg-type]
+        for k in range(first + begins, first + begins + count):
+            mark = begin() if detecting() else None
+            before, state = state, step(state, dt)
+            if mark is not None:
+                watch(before, state, mark, k, grid)
+        return state
+
+    if kept is not None and n > 0 and _begins_to_keep(step):
+        state, first, n = single(state, 1, 0), first + 1, n - 1
+    if kept is None or n == 0:
+        return single(state, n, 0)
+    if isinstance(step, Step):
+        state = step.prepare(state)
+    if kept.states is not None:
+        return binomial(single, state, n, kept.states, step)
+    return in_segments(single, state, n, kept, step)
+
+
+def _begins_to_keep(step: Any) -> bool:
+    """Whether a compiled step has never been called. What it makes at the first call, and keeps, is an argument of the
+    code that is compiled for later ones: called again, that would keep other tensors for the backward pass."""
+    if not isinstance(step, torch.nn.Module):
+        return False
+    modules = list(step.modules())
+    compiled = any(hasattr(m, "_orig_mod") or m._compiled_call_impl is not None for m in modules)
+    return compiled and any(isinstance(m, Step) and m.status is None for m in modules)
