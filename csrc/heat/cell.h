@@ -3,19 +3,19 @@
 #include "common/bspline.h"
 #include "common/host_device.h"
 
-// What one particle adds to the heat operator H_ij = Σ_p κ_p V_p ∇Φ_i · ∇Φ_j with ∇Φ_i = D⁻¹ N_i (x_i − x_p) (Gao et
-// al. 2018, supplement, equation 8), on the (Order + 1)^D nodes of its support, one axis after another (sum
+// Contribution of one particle to the heat operator H_ij = Σ_p κ_p V_p ∇Φ_i · ∇Φ_j with ∇Φ_i = D⁻¹ N_i (x_i − x_p) (Gao
+// et al. 2018, supplement, equation 8), on the (Order + 1)^D nodes of its support, one axis after another (sum
 // factorisation). Distances are in cells. P is a scalar or a pack of particles of one cell.
 //
-// Σ_i N_i = 1 and Σ_i N_i (x_i − x_p) = 0 along each axis, so that the product with H needs but one node value beside
-// differences of neighbours, which a cell takes once for all of its particles: a fourth of the arithmetic is saved, a
-// constant u has no gradient at all, and what is added to a node of little weight keeps its relative accuracy.
+// Σ_i N_i = 1 and Σ_i N_i (x_i − x_p) = 0 along each axis, so that the product with H needs only one node value and
+// differences of neighbours, which a cell computes once for all of its particles: a fourth of the arithmetic is saved,
+// a constant u has no gradient at all, and contributions to a node of small weight keep their relative accuracy.
 namespace mpm {
 inline namespace TORCH_MPM_ISA {
 
 template <int Order, int D>
 constexpr int kSupportNodes = D == 2 ? (Order + 1) * (Order + 1) : (Order + 1) * (Order + 1) * (Order + 1);
-constexpr int kMiddle = 1;  // the node of an axis whose value stays
+constexpr int kMiddle = 1;  // node of an axis whose value is not differenced
 
 // f(first, stride) for the lines of nodes of a support along each axis.
 template <int Order, int D, class F>
@@ -70,7 +70,7 @@ struct CellWeights {
   }
 };
 
-// The factors of the differences; those of the middle node, 1 and 0, are not kept.
+// Factors of the differences; those of the middle node, 1 and 0, are not stored.
 template <int Order, class P, int D>
 struct DifferenceWeights : CellWeights<Order, P, D> {
   using CellWeights<Order, P, D>::weight, CellWeights<Order, P, D>::moment;
@@ -97,7 +97,7 @@ struct DifferenceWeights : CellWeights<Order, P, D> {
   MPM_HD P weigh(int axis, int k, const P& value) const { return k == kMiddle ? value : weight[axis][k] * value; }
 };
 
-// H_{i, i+e} is kept for the node itself and for half of its neighbours, those after it in the order of nodes.
+// H_{i, i+e} is stored for the node itself and for half of its neighbours, those after it in the order of nodes.
 template <int D>
 constexpr int kPairs = D == 2 ? 5 : 14;
 template <int D>
@@ -109,7 +109,7 @@ MPM_HD void pair_offset(int pair, int e[D]) {
   }
 }
 
-// κ V times (D⁻¹ dx)², so that the gradients below, in cells, make H.
+// κ V times (D⁻¹ dx)², so that the gradients below, in cells, give H.
 template <int Order, class P, class T>
 MPM_HD P scaled_conductance(const P& conductance, const T& inverse_dx) {
   const T scale = T(BSpline<Order>::inverse_inertia) * inverse_dx;
@@ -209,11 +209,11 @@ MPM_HD void add_cell_value(const CellWeights<Order, P, D>& s, const P& value, P*
   }
 }
 
-// What is summed over particles: H u, the diagonal of H, H_{i, i+e}, or K_i = D⁻¹ Σ_p κ_p V_p N_i, for which u · H u ≤
-// Σ K_i u_i² (Cauchy-Schwarz with Σ_i N_i (x_i − x_p)(x_i − x_p)ᵀ = D).
+// Sums over particles: H u, the diagonal of H, H_{i, i+e}, or K_i = D⁻¹ Σ_p κ_p V_p N_i, for which u · H u ≤ Σ K_i u_i²
+// (Cauchy-Schwarz with Σ_i N_i (x_i − x_p)(x_i − x_p)ᵀ = D).
 enum class HeatSum { product, diagonal, pair, bound };
 
-// One particle's share of a sum; returns κ V |∇u|² for the product, of which u and `sum` are those of differences. The
+// Share of one particle in a sum; returns κ V |∇u|² for the product, where u and `sum` are those of differences. The
 // offset e is for pairs.
 template <HeatSum Sum, int Order, class P, int D, class U>
 MPM_HD P add_particle(const P f[D], const P& conductance, const U* u, P* sum, const int* e = nullptr) {

@@ -10,7 +10,7 @@
 namespace mpm::cpu {
 inline namespace TORCH_MPM_ISA {
 
-// One value at each node that the particles of a base block touch; rows along the last axis.
+// One value at each node in the support of a base block; rows along the last axis.
 template <int Order, class T, int D>
 struct ScalarTile {
   static constexpr int kWidth = kBlockWidth + Order, kRow = 2 * kBlockWidth;
@@ -103,8 +103,8 @@ T sum_cell(const Topology<T, D>& t, const Field<const T>& x, const Field<const T
   return total;
 }
 
-// Adds a sum over the particles of every base block whose scene is wanted to the nodes; finish(slot, Σ κ V |∇u|²) per
-// base block.
+// Adds a sum over the particles of every base block of an active scene to the nodes; finish(slot, Σ κ V |∇u|²) per base
+// block.
 template <HeatSum Sum, int Order, class T, int D, class Wanted, class Finish>
 void sum_particles(const Topology<T, D>& t, const Field<const T>& x, const Field<const T>& conductance, const T* nodes,
                    T* out, const Wanted& wanted, const Finish& finish, const int* e = nullptr) {
@@ -155,7 +155,7 @@ struct HeatSolver {
   void sum_to(const T* nodes, T* out, const Wanted& wanted, const Finish& finish) const {
     sum_particles<Sum, Order>(a.topology, a.x, a.conductance, nodes, out, wanted, finish);
   }
-  // f(node) for the nodes of every slot whose scene is wanted; the returned sums are kept by slot.
+  // f(node) for the nodes of every slot of an active scene; the returned sums are stored by slot.
   template <class Wanted, class F>
   void for_slots(const Wanted& wanted, const F& f) const {
     parallel_ranges(a.topology.max_blocks, kGrain, [&](int64_t begin, int64_t end) {
@@ -191,7 +191,7 @@ struct HeatSolver {
                [&](int scene, const StartSums<double>& sums) { w.scene[scene] = start_scene(a, scene, sums); });
   }
 
-  // f(scene, sum of what its slots have kept); the order of the sums does not depend on threads.
+  // f(scene, sum over its slots); the order of the sums does not depend on threads.
   template <class Wanted, class Kept, class Sum, class F>
   void for_scenes(const Wanted& wanted, const Kept* kept, const Sum& zero, const F& f) const {
     int64_t slot = 0;

@@ -5,34 +5,34 @@
 #include "heat/operator.cuh"
 #include "heat/scene.cuh"
 
-// The heat solve. Scenes that are small are solved one by one (csrc/heat/scene.cuh), the others here by one
-// persistent kernel: all scenes advance together, phase by phase, with a barrier of the whole grid between phases; a
-// scene that is done takes no further work, and the kernel ends with the last one. The host is never asked, and the
-// kernel can be captured in a graph.
+// The heat solve. Small scenes are solved separately (csrc/heat/scene.cuh), the others here by one persistent kernel:
+// all scenes advance together, phase by phase, with a barrier of the whole grid between phases. A finished scene takes
+// no further work, and the kernel ends with the last one. The host is not involved, and the kernel can be captured in a
+// graph.
 namespace mpm::cuda {
 
 namespace cg = cooperative_groups;
 
-// Threads of a block: of a solve as many as fit in a multiprocessor by their registers, so that few wait at barriers.
+// Threads of a block: for a solve as many as fit in a multiprocessor by their registers, so that few wait at barriers.
 template <int Order, class T>
 constexpr int kHeatThreads = Order == 2 && sizeof(T) == 4 ? 640 : 256;
 constexpr int kItemWork = 192;  // of an item beside its particles, in particles: measured by instructions
 template <int D>
 constexpr int kSlotQuads = kBlockNodes<D> / kBlockWidth;
 
-// Items, slots and thread blocks of a scene; a block takes a row of items, and a row of slots.
+// Items, slots and thread blocks of a scene; a block processes a contiguous range of items, and of slots.
 struct SceneRange {
   int item, item_end, item_block, item_block_end, slot, slot_end, slot_block, slot_block_end;
 };
 
-// Of one solve; more would find nothing to do.
+// Thread blocks of one solve; more would have no work.
 template <class T, int D>
 int64_t most_thread_blocks(const Topology<T, D>& t) {
   return std::max<int64_t>(most_items(t.max_blocks, t.particles), t.max_blocks) / 4 + 1;
 }
 
-// Work space in global memory. A part of a sum is what one thread block adds to one scene. Blocks take their items and
-// slots in the order of scenes, so that block + scene numbers the parts.
+// Work space in global memory. A part of a sum is the share of one thread block in one scene. Blocks process their
+// items and slots in the order of scenes, so that block + scene numbers the parts.
 template <class T, int D>
 struct HeatWorkspace {
   PackedItems<T, D> packed;
@@ -40,7 +40,7 @@ struct HeatWorkspace {
   StartSums<double>* start;  // [parts], as those below
   StepSums<double>* step;
   Curvature* item_curvature;  // of p · H p
-  Curvature* slot_curvature;  // of the rest of p · A p
+  Curvature* slot_curvature;  // of the other terms of p · A p
   HeatScene* scene[2];        // [scenes] after an update, and before the next one
   SceneRange* range;          // [scenes]
   int* first_item;            // [blocks + 1] of each block
@@ -79,7 +79,7 @@ struct HeatWorkspace {
   }
 };
 
-// How many of `count` entries are below; they come first.
+// Number of the `count` entries that are below; they come first.
 template <class Below>
 __device__ int entries_below(int count, const Below& below) {
   int low = 0;
@@ -93,8 +93,8 @@ __device__ int entries_below(int count, const Below& below) {
   return low;
 }
 
-// A kernel of three phases per iteration, a barrier of the grid after each: directions, product, update. What follows
-// from the sums of a phase every thread block finds out by itself, for the scenes of its slots.
+// Kernel of three phases per iteration with a barrier of the grid after each: directions, product, update. Every thread
+// block evaluates the sums of a phase itself, for the scenes of its slots.
 template <int Order, class T, int D>
 struct HeatKernel {
   using S = HeatShape<Order, T, D>;
@@ -106,7 +106,7 @@ struct HeatKernel {
   HeatKernel(const HeatArguments<T, D>& a, bool small)
       : a(a), w(a.topology, a.workspace, small), x(a.x), conductance(a.conductance) {}
 
-  // Whether the scene is solved here, and not by a thread block.
+  // Whether the scene is solved here, and not by a single thread block.
   __device__ bool takes(int scene) const { return !w.apart.left || w.apart.left[scene]; }
   __device__ bool takes_any() const {
     bool any = !w.apart.left;
@@ -120,10 +120,10 @@ struct HeatKernel {
   __device__ int scene_of_item(int item) const { return scene_of(a.topology, items()[item].block); }
   __device__ int scene_of_slot(int slot) const { return scene_of(a.topology, a.topology.block[slot]); }
 
-  // Slots of thread blocks: as many each.
+  // Slots of thread blocks: equal numbers.
   __device__ int first_slot(int block) const { return int(int64_t(*w.used) * block / gridDim.x); }
   __device__ int block_of_slot(int slot) const { return int((int64_t(slot + 1) * gridDim.x - 1) / *w.used); }
-  // Items of thread blocks: as much work each.
+  // Items of thread blocks: equal work.
   __device__ void lay_out_items(int block) const {
     const int count = *schedule_of(a.topology).item_count;
     const int64_t work = count > 0 ? items()[count - 1].end + int64_t(count) * kItemWork : 0;
@@ -149,7 +149,7 @@ struct HeatKernel {
     r.slot_end = slot(scene + 1);
     if (scene == a.topology.scenes - 1) *w.used = r.slot_end;
   }
-  // When the above are known.
+  // After the above are known.
   __device__ void lay_out_parts(int scene) const {
     SceneRange& r = w.range[scene];
     r.item_block = r.slot_block = 0;
@@ -164,7 +164,7 @@ struct HeatKernel {
     }
   }
 
-  // f(scene, slot, end, whether they are the first of the scene) for the slots of this thread block, of scenes taken.
+  // f(scene, slot, end, whether they are the first of the scene) for the slots of this thread block, of active scenes.
   template <class F>
   __device__ void for_slots(const F& f) const {
     const int last = first_slot(blockIdx.x + 1);
@@ -174,7 +174,7 @@ struct HeatKernel {
       if (takes(scene)) f(scene, slot, end, slot == w.range[scene].slot);
     }
   }
-  // f(first node) for the quads of slots, a thread each.
+  // f(first node) for the quads of slots, one per thread.
   template <class F>
   __device__ static void for_quads(int slot, int end, const F& f) {
     for (int64_t quad = int64_t(slot) * kSlotQuads<D> + threadIdx.x; quad < int64_t(end) * kSlotQuads<D>;
@@ -190,7 +190,7 @@ struct HeatKernel {
   __device__ static void add_parts(const V* parts, int scene, int block, int end, V& sum) {
     for (block += threadIdx.x; block < end; block += blockDim.x) sum.add(parts[block + scene]);
   }
-  // What thread 0 decides, in all threads.
+  // Decision of thread 0, in all threads.
   template <class F>
   __device__ static HeatScene decide(const F& f) {
     __shared__ HeatScene scene;
@@ -200,7 +200,7 @@ struct HeatKernel {
     return scene;
   }
 
-  // Adds a sum over particles to `out`, for the scenes wanted; the parts of p · H p are kept.
+  // Adds a sum over particles to `out`, for active scenes; the parts of p · H p are stored.
   template <HeatSum Sum, class Wanted>
   __device__ void sum_to(const T* u, T* out, WarpMemory<S>& memory, const Wanted& wanted) const {
     for (int colour = a.deterministic ? 0 : -1; colour < (a.deterministic ? 1 << D : 0); colour++) {

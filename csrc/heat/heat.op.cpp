@@ -2,7 +2,7 @@
 #include "heat/cell.h"
 #include "heat/kernels.h"
 
-// The implicit heat step on the nodes, and its operator alone.
+// Implicit heat step on the nodes, and its operator alone.
 namespace mpm {
 namespace {
 
@@ -82,7 +82,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> heat_cg(
   return {increment, iterations, residual, converged};
 }
 
-// What the operator and its stencil read.
+// Inputs of the operator and its stencil.
 template <class T, int D>
 HeatOperatorArguments<T, D> operator_arguments(const PackedTopology& blocks, const Tensor& x,
                                                const Tensor& conductance) {

@@ -6,10 +6,10 @@
 #include "heat/cell.h"
 #include "heat/sums.cuh"
 
-// The heat operator H, applied by warps, one item of particles each. A lane takes a cell: it holds the differences of
-// the nodes of the cell's support and what the cell adds to them in registers, and walks the cell's particles. To that
-// end the particles are packed once, as distances from the base node and conductance, in the order in which the lanes
-// read them.
+// The heat operator H, applied by warps, one item of particles each. A lane processes a cell: it holds the differences
+// of the nodes of the cell's support and the contributions of the cell to them in registers, and walks the cell's
+// particles. For this the particles are packed once, as distances from the base node and conductance, in the order of
+// reading by the lanes.
 namespace mpm::cuda {
 
 template <int Order_, class T_, int D_>
@@ -25,7 +25,7 @@ struct HeatShape {
   static constexpr int tile = D == 2 ? width * row : width * plane;
 };
 
-// Read by one warp only, which leaves the cache to the nodes.
+// Read by only one warp, so that the cache is left to the nodes.
 template <class P>
 __device__ P load_once(const P* p) {
   P q;
@@ -45,7 +45,7 @@ union WarpMemory {
   } tile;
   struct {
     uint16_t rank[kItemParticles];
-    unsigned lanes[kItemParticles];  // of a row: those that have a particle of this rank
+    unsigned lanes[kItemParticles];  // of a row: lanes with a particle of this rank
     uint16_t start[kItemParticles];  // of a row in the packed order
     int count[S::cells + 1], row[S::parts];
   } sort;
@@ -56,7 +56,7 @@ struct PackedItems {
   PackedParticle<T, D>* particles;  // [P]
   uint16_t* counts;                 // [items, cells] particles of each cell
 
-  // In a work space, where take(bytes) gives memory.
+  // In a work space, where take(bytes) returns memory.
   template <class Take>
   void lay_out(const Topology<T, D>& t, const Take& take) {
     const int64_t items = most_items(t.max_blocks, t.particles);
@@ -65,7 +65,7 @@ struct PackedItems {
   }
 };
 
-// Particles that a lane takes of its cell in each part of a block.
+// Particles of its cell that a lane processes in each part of a block.
 template <class S>
 struct LaneCounts {
   int of_part[S::parts];
@@ -80,7 +80,7 @@ struct LaneCounts {
 };
 
 // Calls begin(cell, whether there are particles), each(particle) and end(cell) for the cells of an item, a warp's width
-// of them at a time. All lanes do, where they have no particle with one that conducts nothing.
+// of them at a time. All lanes take part, with a non-conducting particle where they have none.
 template <class S, class T, int D, class Begin, class Each, class End>
 __device__ void walk_cells(const LaneCounts<S>& counts, const PackedParticle<T, D>* particles, const Begin& begin,
                            const Each& each, const End& end) {
@@ -110,8 +110,8 @@ __device__ void walk_cells(const LaneCounts<S>& counts, const PackedParticle<T, 
   }
 }
 
-// Packs the particles of an item as `walk_cells` reads them: row by row, the lanes of a row being those with a particle
-// of this rank.
+// Packs the particles of an item in the order of `walk_cells`: row by row, where the lanes of a row are those with a
+// particle of this rank.
 template <class S, class T, int D>
 __device__ void pack_item(const Topology<T, D>& t, const Columns<const T, D>& x, const Columns<const T, 1>& conductance,
                           const Item& item, int number, const PackedItems<T, D>& packed, WarpMemory<S>& memory) {
@@ -179,8 +179,8 @@ __device__ void pack_item(const Topology<T, D>& t, const Columns<const T, D>& x,
   __syncwarp();
 }
 
-// The quads of a base block's tile, in rounds of a warp's width: quad r of a lane lies at entry at[r] of the tile, and
-// at node node[r], -1 where it is none.
+// Quads of a base block's tile, in rounds of a warp's width: quad r of a lane lies at entry at[r] of the tile, and at
+// node node[r], -1 where there is none.
 template <class S>
 struct TileQuads {
   static constexpr int rows = S::D == 2 ? S::width : S::width * S::width, rounds = (2 * rows + 31) / 32;
@@ -269,7 +269,7 @@ __device__ T sum_items(const Topology<T, D>& t, const PackedItems<T, D>& packed,
         },
         [&](int cell) {
           if (Sum == HeatSum::product) to_nodes<S::Order, D>(to);
-          // One node of every cell at a time: they differ, so nothing is added twice at once.
+          // One node of every cell at a time: they differ, so no node is added to concurrently.
           for_support<S>(cell, [&](int k, int i) {
             T value = to[k];
 #pragma unroll
@@ -298,8 +298,8 @@ __device__ T sum_items(const Topology<T, D>& t, const PackedItems<T, D>& packed,
   return power;
 }
 
-// f(first item, end) for the items from `first` on that are this warp's, every `stride`-th; for a colour >= 0, the
-// base blocks of that colour, whole.
+// f(first item, end) for the items of this warp from `first` on, every `stride`-th; for a colour >= 0, the complete
+// base blocks of that colour.
 template <class T, int D, class F>
 __device__ void for_items(const Topology<T, D>& t, int first, int last, int stride, int colour, const F& f) {
   const Schedule<const int> schedule = schedule_of(t);
@@ -314,7 +314,7 @@ __device__ void for_items(const Topology<T, D>& t, int first, int last, int stri
     f(i, end);
   }
 }
-// Of all items, by the warps of all thread blocks.
+// Over all items, by the warps of all thread blocks.
 template <class T, int D, class F>
 __device__ void for_items(const Topology<T, D>& t, int colour, const F& f) {
   for_items(t, blockIdx.x + threadIdx.x / 32 * gridDim.x, *schedule_of(t).item_count, gridDim.x * (blockDim.x / 32),

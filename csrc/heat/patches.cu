@@ -40,7 +40,7 @@ __global__ void __launch_bounds__(kThreads) stencil_kernel(const HeatOperatorArg
     if (slot < 0) continue;
     for (int k = t.offsets[slot]; k < t.offsets[slot + 1]; k++) {
       const int64_t p = t.index[k];
-      T w[D][3], m[D][3];  // of the node before, of the node, and of the one after
+      T w[D][3], m[D][3];  // of the previous node, of the node, and of the next one
       bool touches = true;
 #pragma unroll
       for (int i = 0; i < D; i++) {

@@ -9,12 +9,12 @@
 #include "heat/solve.h"
 #include "heat/sums.cuh"
 
-// The heat solve of small scenes, a thread block each: every scene goes at its own pace, and no barrier is wider than a
-// block. The nodes of the box around a scene are numbered anew; p and H p lie in shared memory, vectors that only the
-// thread of a node reads in global memory. A scene that is too large is left to the kernel of csrc/heat/heat.cu.
+// Heat solve of small scenes, one thread block each: every scene has its own number of iterations, and no barrier is
+// wider than a block. The nodes of the box around a scene are renumbered; p and H p lie in shared memory, vectors that
+// only the thread of a node reads in global memory. Larger scenes are left to the kernel of csrc/heat/heat.cu.
 //
-// H is applied by lanes, one occupied cell each. What the cells add, the block writes one node of every cell at a time:
-// the nodes of different cells differ, so that every sum has a fixed order.
+// H is applied by lanes, one occupied cell each. The block adds the contributions of the cells one node of every cell
+// at a time: the nodes of different cells differ, so that every sum has a fixed order.
 namespace mpm::cuda {
 
 struct SceneCell {
@@ -75,7 +75,7 @@ struct NodeBox {
   }
 };
 
-// First of `count` entries that is not below, found by a warp; those below come first.
+// First of `count` entries that is not below, found by a warp; entries below come first.
 template <class Below>
 __device__ int first_not_below(int count, const Below& below) {
   int low = 0, end = count;
@@ -89,8 +89,8 @@ __device__ int first_not_below(int count, const Below& below) {
   return low;
 }
 
-// Calls each(particle) for `count` particles of every lane; load(at, rank) gives the particle that lies at `at` in the
-// packed order, in which those of rank 0 of all lanes come first.
+// Calls each(particle) for `count` particles of every lane; load(at, rank) returns the particle at `at` in the packed
+// order, in which those of rank 0 of all lanes come first.
 template <class Load, class Each>
 __device__ void walk_lanes(int count, int at, const Load& load, const Each& each) {
   const unsigned before = (1u << lane_index()) - 1;
@@ -121,7 +121,7 @@ struct SceneKernel {
   int most_nodes, most_particles;  // of a small scene
 };
 
-// What the threads of a block share.
+// Shared values of the threads of a block.
 template <int D>
 struct SceneState {
   int slot, slot_end, used;  // slots of the scene, and of all scenes
@@ -203,8 +203,8 @@ struct SceneSolver {
     return slot < 0 ? -1 : slot * kBlockNodes<D> + node_in_block<D>(node);
   }
 
-  // Base node of particle p and distances from it. False for a particle that is not in its base block: its position is
-  // not the one that was activated.
+  // Base node of particle p and distances from it. False for a particle outside its base block: its position is not
+  // that of the activation.
   __device__ bool locate_particle(const Vector<T, D>& position, int base_block, int* base, T* f) const {
     const bool inside = locate<Order>(t.geometry, position.e, base, f);
     int block[D];
@@ -279,7 +279,7 @@ struct SceneSolver {
     return size <= min(int64_t(k.most_nodes), room);
   }
 
-  // Lists the occupied cells; `count` of a cell becomes the place of its first particle.
+  // Lists the occupied cells; `count` of a cell becomes the index of its first particle.
   __device__ void list_cells(int* count) {
     const int share = (nodes + int(blockDim.x) - 1) / int(blockDim.x);
     const int first = min(nodes, int(threadIdx.x) * share), last = min(nodes, first + share);
@@ -301,8 +301,8 @@ struct SceneSolver {
     __syncthreads();
   }
 
-  // Writes the particles of every cell to `order` one after another, in the order of the index tensor, the warps by
-  // turns.
+  // Writes the particles of every cell to `order` one after another, in the order of the index tensor, by the warps in
+  // turn.
   __device__ void order_in_turn(int* next) const {
     for (int first = begin; first < end; first += blockDim.x) {
       const int at = first + int(threadIdx.x), particle = at < end ? t.index[at] : -1;
@@ -325,7 +325,7 @@ struct SceneSolver {
     }
   }
 
-  // f(number of the lane's cell, its first particle and how many, where the particles of the lanes begin) for all
+  // f(number of the lane's cell, its first particle and their number, start of the particles of the lanes) for all
   // cells, 32 neighbours by a warp; `done` is called after every round by all threads.
   template <class F, class Done>
   __device__ void for_cells(const F& f, const Done& done) const {
@@ -485,23 +485,22 @@ __global__ void __launch_bounds__(kSceneThreads<Order, T>)
   solver.finish();
 }
 
-constexpr int kFewNodes = 3072, kFewParticles = 8192;  // a scene of no more is small in any batch
+constexpr int kFewNodes = 3072, kFewParticles = 8192;  // a scene of at most this size is small in any batch
 
-// Whether scenes are small on average. A few keep the device busy by its whole grid of threads; where they are many,
-// they may be larger.
+// Whether scenes are small on average. Few scenes keep the device busy by the grid kernel; many scenes may be larger.
 template <class T, int D>
 bool small_scenes(const Topology<T, D>& t) {
   const bool many = 4 * int64_t(t.scenes) >= device_attribute(cudaDevAttrMultiProcessorCount);
   return t.scenes > 0 && t.particles <= int64_t(t.scenes) * (many ? 32768 : 4096);
 }
 
-// Where there are more scenes than multiprocessors, two at once share one. The shared memory asked for is what scenes
-// of equal size need, whose rows are by more than a fourth outside of their boxes: the less, the larger the cache.
+// With more scenes than multiprocessors, two share one at once. The requested shared memory is that of scenes of equal
+// size with more than a fourth of their rows outside their boxes: the less it is, the larger the cache.
 template <int Order, class T, int D>
 void solve_scenes(SceneKernel<Order, T, D> kernel, Stream stream) {
   const Topology<T, D>& t = kernel.a.topology;
   const int together = t.scenes > device_attribute(cudaDevAttrMultiProcessorCount) ? 2 : 1;
-  const int reserved = 5 * 1024;  // for the system, and for what is not dynamic
+  const int reserved = 5 * 1024;  // for the system, and for static memory
   const int room = device_attribute(cudaDevAttrMaxSharedMemoryPerMultiprocessor) / together - reserved;
   const int64_t nodes = int64_t(t.max_blocks) * kBlockNodes<D> / t.scenes * 3 / 4;
   kernel.most_nodes = int(std::min<int64_t>(room / (2 * sizeof(T)), std::max<int64_t>(nodes, kFewNodes)));

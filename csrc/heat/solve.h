@@ -5,8 +5,8 @@
 #include "common/fields.h"
 #include "grid/topology.h"
 
-// The iteration of the implicit heat step (M/dt + H + X) d = h − (H + X) θ: what happens at a node and what is decided
-// for a scene. The loops of both backends go over nodes, sum over scenes and apply H.
+// The iteration of the implicit heat step (M/dt + H + X) d = h − (H + X) θ: operations at a node and decisions for a
+// scene. The loops of both backends go over nodes, sum over scenes and apply H.
 //
 // Both methods move along p: d += α p, r −= α A p, p = γ z + β p with z = inverse · r. Conjugate gradients divide by
 // the exact diagonal; Chebyshev iteration (Saad 2003, algorithm 12.1) divides by M/dt + X, where the spectrum lies
@@ -29,7 +29,7 @@ struct HeatArguments {
   double tolerance = 0;                // replaced by scene_tolerance where given
   const T* scene_tolerance = nullptr;  // [scenes]
   double relative_tolerance = 0;       // of the first residual
-  int most = 0;                        // iterations, replaced by scene_most where given
+  int most = 0;                        // maximum number of iterations, replaced by scene_most where given
   const int* scene_most = nullptr;     // [scenes]
   HeatMethod method = HeatMethod::conjugate_gradients;
   bool deterministic = false;
@@ -37,7 +37,7 @@ struct HeatArguments {
   int* iterations = nullptr;  // [scenes], as those below
   T* residual = nullptr;
   bool* converged = nullptr;
-  void* workspace = nullptr;  // bytes asked for by heat_workspace()
+  void* workspace = nullptr;  // bytes returned by heat_workspace()
 };
 
 // H u, or the diagonal of H where u is absent.
@@ -48,13 +48,13 @@ struct HeatOperatorArguments {
   const T* nodes = nullptr;  // u [N]
   bool deterministic = false;
   T* sum = nullptr;           // [N], zero on entry
-  void* workspace = nullptr;  // bytes asked for by heat_operator_workspace()
+  void* workspace = nullptr;  // bytes returned by heat_operator_workspace()
 };
 
 // Work space of a solve, [N] each.
 template <class T>
 struct HeatVectors {
-  T* mass;     // M, 0 on nodes that are not solved for
+  T* mass;     // M, 0 on nodes that are not unknowns
   T* weight;   // M/dt + X; K before the start
   T* inverse;  // of the diagonal, see above; H_ii before the start
   T* r;
@@ -111,7 +111,7 @@ MPM_HD double step_of_scene(const HeatArguments<T, D>& a, int scene) {
   return a.scene_dt ? a.dt * double(a.scene_dt[scene]) : a.dt;
 }
 
-// First right side, of increment zero, of node i of the vectors, which lies in `row`. `used` is false for rows of
+// First right side, for zero increment, of node i of the vectors, which lies in `row`. `used` is false for rows of
 // unused blocks.
 template <class T, int D>
 MPM_HD StartSums<T> start_node(const HeatArguments<T, D>& a, const HeatVectors<T>& v, int64_t row, int64_t i, double dt,
@@ -141,7 +141,7 @@ MPM_HD StartSums<T> start_node(const HeatArguments<T, D>& a, const HeatVectors<T
   return sums;
 }
 
-// The next direction; returns the part of p · A p without H.
+// Next direction; returns the part of p · A p without H.
 template <class T>
 MPM_HD T direct_node(const HeatVectors<T>& v, int64_t i, T beta, T gamma) {
   T p = gamma * (v.inverse[i] * v.r[i]);
@@ -185,10 +185,10 @@ MPM_HD void direct_chebyshev(HeatScene& s) {
   }
 }
 
-// Iterations after which the Chebyshev polynomial has brought the residual below the tolerance.
+// Number of iterations after which the Chebyshev polynomial has reduced the residual below the tolerance.
 MPM_HD int chebyshev_count(const HeatScene& s) {
   const double reduction =
-      s.residual / s.tolerance * std::sqrt(s.spread);  // the polynomial's norm weighs with M/dt + X
+      s.residual / s.tolerance * std::sqrt(s.spread);  // the norm of the polynomial has the weights M/dt + X
   const double count = std::ceil(std::acosh(reduction) / std::acosh(1 + 2 / s.bound));
   return count >= s.most ? s.most : count > 1 ? int(count) : 1;
 }
@@ -219,7 +219,7 @@ MPM_HD HeatScene start_scene(const HeatArguments<T, D>& a, int scene, const Star
   return s;
 }
 
-// Step length of conjugate gradients. Without curvature there is nothing left to gain, or the matrix is not positive.
+// Step length of conjugate gradients. Without curvature no decrease remains, or the matrix is not positive.
 MPM_HD void set_step(HeatScene& s, double curvature) {
   s.running = curvature > 0;
   s.alpha = s.running ? s.preconditioned / curvature : 0;
@@ -244,7 +244,7 @@ MPM_HD void finish_iteration(HeatScene& s, HeatMethod method, const StepSums<dou
   s.preconditioned = sums.preconditioned;
 }
 
-// A closed scene keeps its energy, Σ M d = dt Σ h, whatever the solve left over.
+// A closed scene conserves its energy, Σ M d = dt Σ h, for any remaining residual.
 MPM_HD double energy_shift(const HeatScene& s) {
   return s.closed && s.iterations > 0 ? (s.dt * s.source - s.heat) / s.mass : 0;
 }

@@ -2,7 +2,7 @@
 
 #include "heat/solve.h"
 
-// Particles as the heat kernels read them, and sums over lanes and thread blocks in a fixed order.
+// Particles in the form of the heat kernels, and sums over lanes and thread blocks in a fixed order.
 namespace mpm::cuda {
 
 template <class T, int D>

@@ -20,7 +20,7 @@ struct TangentScatterArguments {
   NodeField<T> nodes;  // zero on entry, D channels
 };
 
-// Stresses T_p L_p, in the place of the moments or gradients of a gather.
+// Stresses T_p L_p, in place of the moments or gradients of a gather.
 template <class T, int D>
 struct TangentGatherArguments {
   GatherArguments<T, D> gather;
@@ -47,17 +47,16 @@ struct ConjugateGradients {
 
 enum SolveState : int { kSolving = 0, kConverged = 1, kNegativeCurvature = 2, kNotFinite = 3 };
 
-// The vectors of conjugate gradients with a preconditioner of node blocks B⁻¹. Where B⁻¹ maps to a subspace of a node's
-// velocities, as it does for nodes that are held, the solution stays in it. Where it does so only up to
-// rounding, because the direction is no axis, the forces that hold a node must not stay in the residual, of which they
-// would soon be the most: `held`.
+// Vectors of conjugate gradients with a preconditioner of node blocks B⁻¹. Where B⁻¹ maps to a subspace of a node's
+// velocities, as for held nodes, the solution stays in it. Where it does so only up to rounding, because the direction
+// is not an axis, the reaction of a held node must be removed from the residual, which it would soon dominate: `held`.
 template <class T, int D>
 struct ConjugateGradientsArguments {
   int max_blocks = 0, scenes = 1, blocks_per_scene = 1;
   const int* block = nullptr;  // [max_blocks]
   const T* mass = nullptr;     // [N]
   const T* inverse = nullptr;  // [N, kSymmetric<D>], upper triangles
-  const T* local = nullptr;    // likewise, what a node adds to its own part of the Hessian; or null
+  const T* local = nullptr;    // likewise, additional diagonal block of a node; or null
   const T* held = nullptr;     // [N, D], unit vectors: directions in which nodes are held, zero for none; or null
   const T* rhs = nullptr;      // [N, D]
   int image_groups = 0;
@@ -105,7 +104,7 @@ MPM_HD Vector<T, D> symmetric_times(const T* upper, const T* r) {
   return z;
 }
 
-// What follows for a scene from a sum over its nodes.
+// Decisions for a scene from a sum over its nodes.
 enum class CGPhase : int { start, curvature, step };
 
 MPM_HD void advance_scene(ConjugateGradients& s, CGPhase phase, double sum, double relative) {
@@ -120,7 +119,7 @@ MPM_HD void advance_scene(ConjugateGradients& s, CGPhase phase, double sum, doub
     s.turn = sum / s.square;
     s.square = sum;
     s.iterations++;
-    if (sum < 0) {  // a preconditioner that rounding has left indefinite
+    if (sum < 0) {  // preconditioner made indefinite by rounding
       s.state = kNegativeCurvature;
       s.turn = 0;
     } else if (sum <= relative * relative * s.first) {
@@ -133,7 +132,7 @@ MPM_HD void advance_scene(ConjugateGradients& s, CGPhase phase, double sum, doub
   }
 }
 
-// What a node does in each phase, and what it adds to the sum of its slot. A node of an unused slot has zeros.
+// Operations at a node in each phase, and its summand in the sum of its slot. A node of an unused slot has zeros.
 template <class T, int D>
 MPM_HD double cg_start(const ConjugateGradientsArguments<T, D>& a, int64_t node) {
   double sum = 0;
@@ -192,9 +191,8 @@ MPM_HD void cg_turn(const ConjugateGradientsArguments<T, D>& a, int64_t node, co
   }
 }
 
-// The products of nodes that mirrors make one become what they have in common: the mean of their reflections. Entry k
-// of a group is the row of the node that the axes of the bits of k reflect, -1 for none; a node on a plane is its own
-// image.
+// Products of nodes that mirrors identify become their common part: the mean of their reflections. Entry k of a group
+// is the row of the node that the axes of the bits of k reflect, -1 for none; a node on a plane is its own image.
 template <class T, int D>
 MPM_HD void mirror_group(const ConjugateGradientsArguments<T, D>& a, int group) {
   const int* rows = a.images + int64_t(group) * (1 << D);

@@ -5,7 +5,7 @@ namespace mpm::cpu {
 inline namespace TORCH_MPM_ISA {
 namespace {
 
-// node(index, scene scalars) for all nodes, and the sum of what it returns for each slot.
+// node(index, scene scalars) for all nodes, and the sum of its results for each slot.
 template <class T, int D, class F>
 void for_slots(const ConjugateGradientsArguments<T, D>& a, const F& node) {
   constexpr int64_t grain = 1024 / kBlockNodes<D>;
@@ -21,7 +21,7 @@ void for_slots(const ConjugateGradientsArguments<T, D>& a, const F& node) {
   });
 }
 
-// The sums of the slots of each scene in their order, and what follows from them.
+// Sums of the slots of each scene in their order, and the decisions from them.
 template <class T, int D>
 void advance_scenes(const ConjugateGradientsArguments<T, D>& a, CGPhase phase, double* sums) {
   for (int b = 0; b < a.scenes; b++) sums[b] = 0;

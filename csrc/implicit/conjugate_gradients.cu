@@ -8,7 +8,7 @@ constexpr int kThreads = 128, kSumThreads = 1024, kLanes = 16;  // lanes that sh
 
 enum class Pass : int { start, curvature, step, turn };
 
-// kLanes threads take the nodes of a slot, and add up what these return in a fixed order.
+// kLanes threads process the nodes of a slot, and sum the results in a fixed order.
 template <class T, int D>
 __global__ void __launch_bounds__(kThreads) cg_pass_kernel(const ConjugateGradientsArguments<T, D> a, Pass pass) {
   const int64_t thread = int64_t(blockIdx.x) * kThreads + threadIdx.x, slot = thread / kLanes;
@@ -31,7 +31,7 @@ __global__ void __launch_bounds__(kThreads) cg_pass_kernel(const ConjugateGradie
   if (block >= 0 && lane == 0) a.slots[slot] = sum;
 }
 
-// A thread block adds up the slots of a scene in a fixed order.
+// A thread block sums the slots of a scene in a fixed order.
 template <class T, int D>
 __global__ void __launch_bounds__(kSumThreads)
     cg_scene_kernel(const ConjugateGradientsArguments<T, D> a, CGPhase phase) {

@@ -5,7 +5,7 @@
 namespace mpm::cpu {
 inline namespace TORCH_MPM_ISA {
 
-// The particles of a group as a kernel body reads them (common/lanes.h).
+// Particles of a group in the form of a kernel body (common/lanes.h).
 template <class T, int N>
 struct Grouped {
   using Value = Pack<T, N>;

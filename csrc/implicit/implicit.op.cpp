@@ -3,12 +3,12 @@
 #include "rollout/replay.h"
 #include "transfer/kernels.h"
 
-// The Hessian of an implicit step: its product with node vectors, its diagonal blocks, and the solve.
+// Hessian of an implicit step: its product with node vectors, its diagonal blocks, and the solve.
 namespace mpm {
 namespace {
 
-// The product of the tangents alone: a gather and a scatter, on the CPU with the tangents in the scatter, on CUDA in
-// the gather, where their loads wait beside others. What is between them has a buffer for many products.
+// Product of the tangents alone: a gather and a scatter, on the CPU with the tangents in the scatter, on CUDA in the
+// gather, where their loads overlap with others. Intermediate values have a buffer for many products.
 template <class T, int D>
 class TangentProduct {
  public:
@@ -114,10 +114,10 @@ void set_images(ConjugateGradientsArguments<T, D>& a, const Tensor& images, cons
   a.images = int_pointer(images, "images", x, {images.size(0), 1 << D});
 }
 
-// Iterations that a solve has at least where it matters how long it takes.
+// Minimum number of iterations of a solve whose duration matters.
 constexpr int kWorthATeam = 16;
 
-// Iterations until all scenes are done: of a graph in which the device finds out, or with looks of the host.
+// Iterations until all scenes are done: of a graph that the device ends, or with checks by the host.
 template <class T, int D, class Iteration>
 void iterate(ConjugateGradientsArguments<T, D>& a, [[maybe_unused]] const Tensor& x, backend::Stream stream,
              const Iteration& iteration) {

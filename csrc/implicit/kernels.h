@@ -3,9 +3,9 @@
 #include "common/backend.h"
 #include "implicit/arguments.h"
 
-// tangent_scatter and tangent_gather: where a backend applies the tangents.
-// cg_begin: x, r, p and the scalars from rhs. cg_advance: one iteration, with the product of the tangents in q.
-// cg_look: how many scenes are not done, on the host; with CUDA 13 whether a graph goes on, which the device finds out.
+// tangent_scatter and tangent_gather: whichever of the two applies the tangents on a backend. cg_begin: x, r, p and the
+// scalars from rhs. cg_advance: one iteration, with the product of the tangents in q. cg_look: number of scenes that
+// are not done, on the host; with CUDA 13 the condition of the graph, on the device.
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
 #define MPM_TANGENT_KERNEL(ORDERED) ORDERED(tangent_scatter, TangentScatterArguments)
 #else

@@ -8,7 +8,7 @@ namespace {
 
 constexpr int kThreads = 128;
 
-// Where a particle lies: the slot of its base node's block, -1 where it is not transferred.
+// Place of a particle: the slot of its base node's block, -1 where it is not transferred.
 template <int Order, class T, int D>
 __device__ int locate_particle(const NodeBlocksArguments<T, D>& a, const Schedule<const int>& s, int p, int* base,
                                T* f) {
@@ -77,8 +77,8 @@ __device__ void add_particle(const NodeBlocksArguments<T, D>& a, const Schedule<
   }
 }
 
-// colour < 0: a thread per particle, with atomics. Otherwise a thread per base block of that colour, which takes its
-// particles in the order of the index tensor.
+// colour < 0: a thread per particle, with atomics. Otherwise a thread per base block of that colour, which processes
+// its particles in the order of the index tensor.
 template <int Order, class T, int D>
 __global__ void __launch_bounds__(kThreads) node_blocks_kernel(const NodeBlocksArguments<T, D> a, int colour) {
   const Topology<T, D>& t = a.topology;

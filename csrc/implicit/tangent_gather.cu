@@ -1,12 +1,12 @@
 #include "transfer/gather.cuh"
 
-// After it: mpm::min of laws/hencky_strain.h would take the place of CUDA's.
+// Included after it: mpm::min of laws/hencky_strain.h would otherwise replace that of CUDA.
 #include "implicit/arguments.h"
 
 namespace mpm::cuda {
 
-// The stress that the tangents make of velocity gradients, computed where these are gathered: there the loads of
-// tangents wait beside those of nodes, while a scatter stands still for them.
+// Stress of the tangents for velocity gradients, computed where these are gathered: there the loads of tangents overlap
+// those of nodes, while a scatter would stall for them.
 template <int Order_, class T_, int D_, bool Gradient>
 struct TangentGather {
   using T = T_;
@@ -22,7 +22,7 @@ struct TangentGather {
   Columns<const T, D> position;
   Columns<const T, kTangentEntries<D>> tangent;
   Columns<T, D * D> stress;
-  T scale;  // from cells
+  T scale;  // converts from cells
 
   explicit TangentGather(const TangentGatherArguments<T, D>& a)
       : topology(a.gather.topology),

@@ -64,8 +64,8 @@ struct CamClay : HenckyElasticity {
     T size, cosine;  // a, cos ϑ of the pressure
   };
 
-  // The yield surface after the compaction w, with ln (p_c/p₀) kept within ±10: far softer, the surface would be lost
-  // in the rounding of the trial pressure.
+  // Yield surface after the compaction w, with ln (p_c/p₀) bounded by ±10: a much softer surface would be lost in the
+  // rounding of the trial pressure.
   template <class T>
   MPM_HD static Ellipse<T> ellipse(const State<T>& c, const T& w) {
     const T exponent = min(max(c.exponent + c.theta * w, T(-10)), T(10));
@@ -101,8 +101,8 @@ struct CamClay : HenckyElasticity {
             lift(c.theta),    lift(c.beta),  lift(c.exponent), lift(c.initial)};
   }
 
-  // w between 0 and the compaction at which the pressure would reach the centre of the first ellipse: the ellipse moves
-  // to meet it, so that cos ϑ changes sign before. Newton's method in a bracket; the last step, in T, carries the
+  // w lies between 0 and the compaction at which the pressure would reach the centre of the first ellipse: the ellipse
+  // moves towards it, so that cos ϑ changes sign before. Newton's method in a bracket; the last step, in T, carries the
   // derivatives of the root.
   template <class T>
   MPM_HD static Compaction<T> compaction(const State<T>& state, const MaskOf<T>& wanted) {

@@ -2,12 +2,12 @@
 
 #include "laws/principal_law.h"
 
-// Elasticities in principal strains that several laws share.
+// Elasticities in principal strains shared by several laws.
 namespace mpm {
 inline namespace TORCH_MPM_ISA {
 
 // Small strain elasticity in Hencky strains: ψ = μ Σ hᵢ² + λ/2 (tr h)² (Hencky 1928). The parameters begin with μ, λ
-// [Pa]. Convex maps of the deviator and the trace alone are radial.
+// [Pa]. Convex maps of the deviator and the trace are radial.
 struct HenckyElasticity : PrincipalLaw {
   template <class T, int D>
   MPM_HD static T energy(const Vector<T, D>& h, const T p[], const T[]) {

@@ -8,7 +8,7 @@ inline namespace TORCH_MPM_ISA {
 template <class Law>
 struct FibreKernels;
 
-// Fibres with a direction d at rest and an activation a, beside a law of the solid that they are in:
+// Fibres with a direction d at rest and an activation a, added to a law of the surrounding solid:
 //   ψ = a/2 (|F d|² − 1),   τ = a (F d) (F d)ᵀ,
 // the actuation F A Fᵀ of ChainQueen (Hu et al. 2019) with A = a d dᵀ. In 2-D the last entry of d has no meaning.
 struct Fibre : InvariantLaw {
@@ -21,7 +21,7 @@ struct Fibre : InvariantLaw {
   using Kernels = FibreKernels<Law>;
 };
 
-// What a particle's fibre is made of; also the adjoints of these.
+// Fibre of a particle; also the adjoints of its entries.
 template <class S, int D>
 struct FibreState {
   Matrix<S, D> F;
@@ -55,7 +55,7 @@ struct FibreState {
   }
 };
 
-// The bodies of the kernels.
+// Bodies of the kernels.
 template <class Law>
 struct FibreKernels {
   template <class At, class T, int D>
@@ -74,14 +74,14 @@ struct FibreKernels {
     return s;
   }
 
-  // Whether the solid may have a stress. An activation that is not finite is not hidden.
+  // Whether the solid has a valid stress. An activation that is not finite is not hidden.
   template <class V, int D>
   MPM_HD static MaskOf<V> is_valid_at(const FibreState<V, D>& s) {
     const V J = determinant(s.F);
     return is_valid(J, J);
   }
 
-  // A state with derivatives along a direction; an absent part of it is zero.
+  // State with derivatives along a direction; an absent part of it is zero.
   template <class At, class T, int D>
   MPM_HD static FibreState<Dual<typename At::Value>, D> load_direction(const At& at, const LawArguments<T, D>& a,
                                                                        const Field<const T>& along_state,

@@ -3,9 +3,9 @@
 #include "common/svd.h"
 #include "common/wide.h"
 
-// What isotropic laws in principal strains share: the Hencky strains of F, and the adjoint of an isotropic tensor
-// function of F from that of its principal values.
-// A function that many kernels share and that is too large for a call to matter: on the CPU it is compiled once.
+// Common parts of isotropic laws in principal strains: the Hencky strains of F, and the adjoint of an isotropic tensor
+// function of F from that of its principal values. A function that many kernels share and that is too large for
+// inlining to pay: on the CPU it is compiled once.
 #if defined(__CUDACC__)
 #define MPM_HD_LARGE MPM_HD
 #else
@@ -81,17 +81,17 @@ MPM_HD T sinhc(const T& x) {
   return hyperbolic(x).sinhc;
 }
 
-// F = U diag(exp h) Vᵀ with B = Fᵀ U = V diag(exp h) up to a power of two: no V and no order of the strains is needed.
+// F = U diag(exp h) Vᵀ with B = Fᵀ U = V diag(exp h) up to a power of two: neither V nor an order of the strains is
+// needed.
 template <class T, int D>
 struct HenckyStrain {
   Matrix<T, D> U, B;
   Vector<T, D> h, inverse;  // reciprocal lengths of the columns of B
-  T scale;                  // of B
+  T scale;                  // scale of B
   MaskOf<T> valid;          // det F > 0, everything finite
 };
 
-// ln a of the square of a stretch, where a warp of a GPU should take one branch: small strains are never below the
-// other.
+// ln a of the square of a stretch, where a warp of a GPU should take one branch: small strains never take the other.
 #ifdef __CUDACC__
 MPM_HD float logarithm_of_square(float a, float a_minus_1) {
   return a_minus_1 > -0.75f ? ::log1pf(a_minus_1) : ::logf(a);
@@ -114,7 +114,7 @@ MPM_HD T scale_of_strain(const Matrix<T, D>& F) {
   return select(moderate, T(1), inverse_power_of_two(largest));
 }
 
-// The rest of s from its U, B and scale.
+// Other members of s from its U, B and scale.
 template <class T, int D>
 MPM_HD void measure_strain(HenckyStrain<T, D>& s) {
   T shift = T(0);
@@ -149,8 +149,8 @@ MPM_HD Matrix<T, D> orthogonalized(const Matrix<T, D>& U) {
   return U * (T(1.5) * identity<T, D>() - T(0.5) * (transpose(U) * U));
 }
 
-// Strains and axes in float64 of an F in float32: every digit of a difference of strains is that of F. The axes come
-// from float32, and a sweep in float64 makes them exact, or two where three in float32 were too few.
+// Strains and axes in float64 of an F in float32: every digit of a difference of strains is that of F. The axes are
+// computed in float32, and a sweep in float64 makes them exact, or two sweeps where three in float32 were too few.
 template <class T, int D>
 MPM_HD_LARGE HenckyStrain<Wide<T>, D> wide_hencky_strain(const Matrix<T, D>& F) {
   using W = Wide<T>;
@@ -202,14 +202,14 @@ struct Quotients {
   T map, stress;
 };
 
-// Adjoint of F in principal axes, of F ↦ U diag(exp H) Vᵀ and τ = U diag(τᵢ) Uᵀ. `diagonal` is the adjoint of h;
-// Uᵀ F̄ V = even + odd and N = Uᵀ τ̄ U are the adjoints of the results in the same axes, as symmetric and skew part.
-// Divided differences of exp H and τ by exp h are written with sinh x/x, so that they hold at equal strains.
+// Adjoint of F in principal axes, of F ↦ U diag(exp H) Vᵀ and τ = U diag(τᵢ) Uᵀ. `diagonal` is the adjoint of h; Uᵀ F̄
+// V = even + odd and N = Uᵀ τ̄ U are the adjoints of the results in the same axes, as symmetric and skew part. Divided
+// differences of exp H and τ by exp h are written with sinh x/x, so that they are valid at equal strains.
 template <class T, int D, class F>
 MPM_HD Matrix<T, D> principal_adjoint(const HenckyStrain<T, D>& s, const Vector<T, D>& H, const Vector<T, D>& diagonal,
                                       const Matrix<T, D>& even, const Matrix<T, D>& odd, const Matrix<T, D>& N,
                                       const F& quotients) {
-  Vector<T, D> inverse, root;  // of the stretches; of what the map multiplies them by
+  Vector<T, D> inverse, root;  // of the stretches; of the factors of the map
   Matrix<T, D> r;
   MPM_UNROLL for (int i = 0; i < D; i++) {
     inverse[i] = s.scale * s.inverse[i];

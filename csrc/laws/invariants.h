@@ -5,7 +5,7 @@
 #include "laws/strain.h"
 #include "laws/tangent.h"
 
-// Laws without a decomposition: stress and energy follow from F Fᵀ, J and the velocity gradient. Such a law gives
+// Laws without a decomposition: stress and energy follow from F Fᵀ, J and the velocity gradient. Such a law defines
 //   energy(s, p), stress(s, p)          ψ and the Kirchhoff stress τ of a Strain s, with its parameters p;
 //   wave_modulus(s, p)                  ρ₀ c² of the fastest plane wave, or an upper bound;
 //   stiffness(s, p)                     an upper bound of the tangent modulus over all velocity gradients of unit norm.
@@ -30,7 +30,7 @@ struct InvariantLaw {
 template <class Law>
 constexpr bool kShear = Law::field == Deformation::gradient;
 
-// What a law reads of a particle: F with shear, otherwise J; C with viscosity.
+// Inputs of a law at a particle: F with shear, otherwise J; C with viscosity.
 template <class Law, class T, int D>
 struct InvariantState {
   Matrix<T, D> F;
@@ -83,13 +83,13 @@ MPM_HD Matrix<T, D> stress_of(const InvariantState<Law, T, D>& state) {
   return or_zero(is_valid(s.J, sum_of_entries(tau)), tau);
 }
 
-// Which adjoints are wanted.
+// Requested adjoints.
 struct InvariantNeeds {
   bool state, C, parameters;
 };
 
-// The gradient of a scalar function of strain and parameters. `derivative(strain, parameters)` gives its derivative in
-// the direction that the dual numbers carry; it is asked once for each independent direction.
+// Gradient of a scalar function of strain and parameters. `derivative(strain, parameters)` returns its derivative in
+// the direction of the dual numbers; it is evaluated once for each independent direction.
 template <class Law, class T, int D, class Derivative>
 MPM_HD InvariantState<Law, T, D> gradient(const InvariantState<Law, T, D>& state, const Strain<T, D>& s,
                                           const InvariantNeeds& needs, const Derivative& derivative) {
@@ -186,7 +186,7 @@ MPM_HD void store_state(const At& at, const InvariantState<Law, V, D>& g, const 
     for (int k = 0; k < kParameters<Law>; k++) store_entry(at, parameters, k, convert<Value>(g.parameters[k]));
 }
 
-// A state with derivatives along a direction; an absent part of it is zero.
+// State with derivatives along a direction; an absent part of it is zero.
 template <class Law, class V, class At, class T, int D>
 MPM_HD InvariantState<Law, Dual<V>, D> load_direction(const At& at, const LawArguments<T, D>& a,
                                                       const Field<const T>& along_state, const Field<const T>& along_C,
@@ -224,8 +224,8 @@ MPM_HD InvariantState<Law, V, D> derivative_of(const InvariantState<Law, Dual<V>
   return r;
 }
 
-// The tangent of a law with shear: dual numbers at diag(σ), along each strain and along each shear of the principal
-// axes, which turns the axes of the stress by as much as the stretches do: dτᵢⱼ = (τᵢ − τⱼ) σⱼ²/(σᵢ² − σⱼ²).
+// Tangent of a law with shear: dual numbers at diag(σ), along each strain and along each shear of the principal axes,
+// which rotates the axes of the stress by as much as the stretches: dτᵢⱼ = (τᵢ − τⱼ) σⱼ²/(σᵢ² − σⱼ²).
 template <class Law, class V, int D>
 MPM_HD Tangent<V, D> tangent_of_deformation(const InvariantState<Law, V, D>& state, const HenckyStrain<V, D>& s,
                                             const Matrix<V, D>& before, const V& weight) {
@@ -257,7 +257,7 @@ MPM_HD Tangent<V, D> tangent_of_deformation(const InvariantState<Law, V, D>& sta
   });
 }
 
-// Of a fluid, with dJ = J₀ tr L: the same number between all diagonal entries.
+// For a fluid, with dJ = J₀ tr L: the same number between all diagonal entries.
 template <class Law, class V, int D>
 MPM_HD Tangent<V, D> tangent_of_volume(const InvariantState<Law, V, D>& state, const V& before, const V& weight) {
   Dual<V> p[kParameters<Law>];
@@ -274,7 +274,7 @@ MPM_HD Tangent<V, D> tangent_of_volume(const InvariantState<Law, V, D>& state, c
   return t;
 }
 
-// The bodies of the kernels. Energies are small differences of large terms near rest: they are evaluated in float64 for
+// Bodies of the kernels. Energies are small differences of large terms near rest: they are evaluated in float64 for
 // either scalar type.
 template <class Law>
 struct InvariantKernels {
@@ -301,8 +301,8 @@ struct InvariantKernels {
     store_state(at, g, a.state, a.C, a.parameters);
   }
 
-  // Of L = τ̄ : τ(z) with gradient ∇L: the derivative of ∇L along a direction, and that of τ, which is ∂/∂τ̄ of ∇L along
-  // it.
+  // For L = τ̄ : τ(z) with gradient ∇L: the derivative of ∇L along a direction, and that of τ, which is ∂/∂τ̄ of ∇L
+  // along it.
   template <class At, class T, int D>
   MPM_HD static void double_backward(const LawDoubleBackwardArguments<T, D>& a, const At& at) {
     using V = typename At::Value;

@@ -1,4 +1,4 @@
-// The CPU loops of the laws of one header, MPM_LAW_HEADER.
+// CPU loops of the laws of one header, MPM_LAW_HEADER.
 #define MPM_REGISTER_LAW(Law) \
   static const bool Law##_is_entered = enter<cpu::LawLoops, Law>(int(cpu::Level::TORCH_MPM_ISA));
 
@@ -12,8 +12,8 @@ inline namespace TORCH_MPM_ISA {
 template <class Law, class T, int D>
 struct LawLoops {
   using Kernels = typename Law::template Kernels<Law>;
-  // Where memory is what a kernel waits for, packs fill cache lines: the 18 arrays of F and τ may fall on the same
-  // cache sets (when P is a power of two), and then a line does not survive until its other half is read.
+  // Where memory limits a kernel, packs fill cache lines: the 18 arrays of F and τ may share cache sets (when P is a
+  // power of two), and then a line does not survive until its other half is read.
   static constexpr int kBytes = Law::memory_bound ? 64 : kRegisterBytes;
 
   template <int Bytes, class F>
@@ -21,7 +21,7 @@ struct LawLoops {
     for_groups<T, Bytes, Law::memory_bound>(a.particles, body, a.members);
   }
 
-  // Without packs: what is seldom called, and would take minutes to compile with dual numbers of packs.
+  // Without packs: rarely called functions, which would take minutes to compile with dual numbers of packs.
   template <class F>
   static void one_by_one(const LawArguments<T, D>& a, const F& body) {
     constexpr int64_t grain = 256;  // particles below which a range is not split
@@ -50,7 +50,8 @@ struct LawLoops {
   static void scalar(const LawScalarArguments<T, D>& a, void*) {
     by_groups<kRegisterBytes>(a.law, [&](const auto& at) { Kernels::scalar(a, at); });
   }
-  // With a decomposition, which is written for packs; nested dual numbers of packs would take minutes without.
+  // With a decomposition, which is written for packs; nested dual numbers of packs would take minutes to compile
+  // without.
   template <class F>
   static void for_energies(const LawArguments<T, D>& a, const F& body) {
     if constexpr (Law::twice_differentiable)

@@ -1,4 +1,4 @@
-// The CUDA kernels of the laws of one header, MPM_LAW_HEADER: one thread per particle.
+// CUDA kernels of the laws of one header, MPM_LAW_HEADER: one thread per particle.
 #define MPM_REGISTER_LAW(Law) static const bool Law##_is_entered = enter<cuda::LawLaunches, Law>(0);
 
 #include "laws/registry.h"
@@ -8,7 +8,7 @@
 
 namespace mpm::cuda {
 
-// Thread blocks per multiprocessor, which bound the registers, or 0: as the compiler likes. float64 takes twice as many
+// Thread blocks per multiprocessor, which bound the registers, or 0 for no bound. float64 takes twice as many
 // registers.
 template <class Law, class T>
 constexpr int kUpdateBlocks = sizeof(T) == 4 ? Law::gpu_update_blocks : (Law::gpu_update_blocks + 1) / 2;
@@ -23,7 +23,7 @@ __global__ void __launch_bounds__(Law::gpu_threads, kUpdateBlocks<Law, T>)
   using At = std::conditional_t<Adds, Adding<One<T>>, One<T>>;
   const int64_t p = int64_t(blockIdx.x) * Law::gpu_threads + threadIdx.x;
   if (p < a.law.particles && a.law.members.has(p)) Law::template Kernels<Law>::update(a, At(One<T>{p}));
-  wait_for_kernel_before();  // since the next one waits for this alone
+  wait_for_kernel_before();  // since the next kernel waits only for this one
 }
 
 template <class Law, bool Adds, class T, int D>
@@ -76,8 +76,8 @@ constexpr int history_entries() {
   return entries;
 }
 
-// The momentum of particles whose stress is computed as they are loaded, and kept where it has a place. Where it may
-// move them, F or J are moved first if the G2P before has left that.
+// Momentum of particles whose stress is computed as they are loaded, and stored where it has a destination. Where
+// requested, F or J is updated first if the previous G2P has deferred the update.
 template <class Law, class T, int D, bool MayMove>
 struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true> {
   using Base = MomentumSource<2, T, D, Stress::moment, true>;
@@ -87,9 +87,9 @@ struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true> {
   LawUpdateArguments<T, D> law;
   LateDeformation<T, D> late;
   Columns<const T, moves_F ? D * D : 1> state;  // F or J, as given
-  Columns<T, moves_F ? D * D : 1> kept;         // and as they are to be kept; perhaps absent
+  Columns<T, moves_F ? D * D : 1> kept;         // and their destination; optional
 
-  // What the law leaves of a particle.
+  // Result of the law at a particle.
   struct Changes {
     Matrix<T, D> F;
     T J, history[entries > 0 ? entries : 1];
@@ -102,7 +102,7 @@ struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true> {
                     const LateDeformation<T, D>& late = {})
       : Base(a), law(law), late(late), state(law.law.state, D), kept(Law::plastic ? law.state : late.state, D) {}
 
-  // What the law needs of a particle but for its history.
+  // Inputs of the law at a particle, except its history.
   __device__ void fetch(int p, Changes& changes) const {
     if constexpr (!moves_F) {
       changes.J = state.at(p);
@@ -117,7 +117,7 @@ struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true> {
     for (int k = 0; k < kParameters<Law>; k++) r.value[k] = load_parameter(One<T>{p}, law.law, k);
     return r;
   }
-  // The stress, from what was fetched, which becomes what is to be kept.
+  // Stress from the loaded inputs, which become the values to be stored.
   __device__ Matrix<T, D> stress(int p, const Matrix<T, D>& C, const T& dt, const Parameters& parameters,
                                  Changes& changes) const {
     const One<T> at{p};
@@ -174,14 +174,14 @@ struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true> {
     m.stress = update(p, m.affine, m.dt);
     return m;
   }
-  // Its stress is zero yet; `of_motion` is the row of its velocity and affine field.
+  // Its stress is still zero; `of_motion` is the row of its velocity and affine field.
   __device__ ParticleMomentum<T, D> read(int p, int scene, int of_motion) const {
     ParticleMomentum<T, D> m = Base::fields.read_at_rest(p, Base::fields.time_step(scene));
     Base::fields.read_motion(of_motion, m);
     return m;
   }
-  // Outside the grid, where F has to be moved once more after the particle has left; then its affine field is zero. Of
-  // a position that is not finite it may be NaN, and F stays.
+  // Outside the grid, where F has to be updated once more after the particle has left; then its affine field is zero.
+  // For a position that is not finite it may be NaN, and F is unchanged.
   __device__ void leave_out(int p) const {
     const auto m = read(p, scene_of_late(p), p);
     const bool finite = is_finite<D>(read_vector(Base::position, p).e);
@@ -198,7 +198,7 @@ struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true> {
   }
 };
 
-// The same of particles that P2G also puts in the order of its items, if the call owns them.
+// The same for particles that P2G also moves into the order of its items, if the call owns them.
 template <class Law, class T, int D>
 struct SettlingSource : LawMomentumSource<Law, T, D, true> {
   using Base = LawMomentumSource<Law, T, D, true>;
@@ -244,7 +244,7 @@ struct SettlingSource : LawMomentumSource<Law, T, D, true> {
   }
 };
 
-// Of float alone: in double the kernels would take all registers. And of laws that are all of a material.
+// In float only: in double the kernels would need all registers. And only for laws that are the only one of a material.
 template <class Law, class T, int D>
 struct FusedLaunch {};
 
@@ -280,7 +280,7 @@ struct LawLaunches : FusedLaunch<Law, T, D> {
     if (a.law.particles > 0)
       launch(kernel, blocks(a.law.particles), Law::gpu_threads, 0, static_cast<Stream>(stream), a);
   }
-  // Of a kernel that waits for the one before it.
+  // For a kernel that waits for the previous one.
   template <class Arguments>
   static void in_chain(void (*kernel)(Arguments), const Arguments& a, void* stream) {
     if (a.law.particles > 0)

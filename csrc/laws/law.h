@@ -8,32 +8,32 @@
 #include "grid/geometry.h"
 
 // A law is one header with a struct that ends with MPM_REGISTER_LAW(Struct). The struct has
-//   name, parameters, history   what it is called; its parameters and history variables, each a Quantity;
-//   field                       what of the deformation it reads and moves: F, or the volume ratio J alone;
+//   name, parameters, history   its name; its parameters and history variables, each a Quantity;
+//   field                       field of the deformation that it reads and updates: F, or the volume ratio J alone;
 //   viscous                     whether its stress reads the velocity gradient C;
-//   plastic                     whether it changes the deformation, or history, that it is given;
-//   additive                    whether it is part of a material beside another law, to whose stress its own is added;
-// and, written for any scalar (a number, a pack of numbers, a dual number), the functions that one of two forms asks
-// for: laws of strain invariants (laws/invariants.h), which need no decomposition, or laws of principal strains
-// (laws/principal_law.h). Their derivatives come from dual numbers. A law may bring kernel bodies of its own
-// (laws/sand.h) where its adjoint asks for more than that.
+//   plastic                     whether it changes the given deformation or history;
+//   additive                    whether its stress is added to that of another law of the same material;
+// and, written for any scalar (a number, a pack of numbers, a dual number), the functions of one of two forms: laws of
+// strain invariants (laws/invariants.h), which need no decomposition, or laws of principal strains
+// (laws/principal_law.h). Their derivatives come from dual numbers. A law may define its own kernel bodies
+// (laws/sand.h) where its adjoint needs more.
 //
-// Nothing else has to know the law: setup.py compiles laws/law.cpu.cpp and laws/law.cu once for each such header, which
-// enter its kernels in the registry (laws/registry.h) that the ops and Python read.
+// No other file has to name the law: setup.py compiles laws/law.cpu.cpp and laws/law.cu once for each such header,
+// which register its kernels (laws/registry.h) for the ops and Python.
 #ifndef MPM_REGISTER_LAW
 #define MPM_REGISTER_LAW(Law)
 #endif
 
 namespace mpm {
 
-// A parameter or history variable: its unit ("" for a pure number) and the range of its values, ends included or not.
-// Infinite ends mean any finite number.
+// Parameter or history variable: its unit ("" for a pure number) and the range of its values, with inclusive or
+// exclusive ends. Infinite ends mean any finite number.
 struct Quantity {
   const char* name;
   const char* unit;
   double low = -INFINITY, high = INFINITY;
   bool with_low = true, with_high = true;
-  bool matrix = false;  // history alone: D by D entries
+  bool matrix = false;  // history only: D by D entries
 };
 
 constexpr Quantity real(const char* name, const char* unit) { return {name, unit}; }
@@ -44,25 +44,25 @@ constexpr Quantity matrix(const char* name, const char* unit) {
   return {name, unit, -INFINITY, INFINITY, true, true, true};
 }
 
-// The time step [s] of a law whose flow takes time: the last of its parameters.
+// Time step [s] of a rate-dependent law: the last of its parameters.
 constexpr Quantity time_step = not_negative("dt", "s");
 
 enum class Deformation : int { gradient, volume_ratio };
 
 constexpr int kMostParameters = 8, kMostHistory = 4;
 
-// A parameter that is uniform, per scene or per particle.
+// Parameter that is uniform, per scene or per particle.
 template <class T>
 struct Parameter {
   const T* pointer = nullptr;
   int64_t stride = 0;  // elements from particle to particle, or from scene to scene
-  int64_t scenes = 0;  // where it is per scene: scenes that have one; 0 otherwise
+  int64_t scenes = 0;  // where it is per scene: number of scenes that have one; 0 otherwise
 };
 
 template <class T, int D>
 struct LawArguments {
   int64_t particles = 0;
-  Members members;             // of a mixture: the particles of this law; others stay as they are
+  Members members;             // in a mixture: the particles of this law; others are unchanged
   Field<const T> state;        // trial F [P, D, D], or J [P]
   Field<const T> C;            // [P, D, D], may be absent; of viscous laws
   const int* scene = nullptr;  // int32 [P], where a parameter is per scene
@@ -74,21 +74,21 @@ struct LawArguments {
 
 enum FlowBranch : int { kElasticFlow = 0, kPlasticFlow = 1, kApexFlow = 2, kInvalidFlow = 3, kNotConverged = 4 };
 
-// A deformation that is not finite or has no positive volume, or whose stress overflows, is invalid: it is returned as
-// it is and so is its history, its stress and moduli are zero, so that it does no harm to its neighbours, its energy is
-// infinite, and no derivative passes but those of deformation and history with respect to themselves.
+// A deformation that is not finite or has no positive volume, or whose stress overflows, is invalid. It is returned
+// unchanged with its history. Its stress and moduli are zero, so that it does not affect its neighbours, its energy is
+// infinite, and no derivative passes except those of deformation and history with respect to themselves.
 template <class T, int D>
 struct LawUpdateArguments {
   LawArguments<T, D> law;
   Field<T> state;         // absent for laws that do not change it
   Field<T> stress;        // [P, D, D]
-  bool adds = false;      // to the stress that is there; of additive laws
+  bool adds = false;      // added to the present stress; for additive laws
   Field<T> history;       // [P, m], absent without history
   Field<T> dissipated;    // [P], absent where not wanted
   Field<T> multiplier;    // [P], length of the plastic increment of the Hencky strains; absent where not wanted
   int* branch = nullptr;  // [P] FlowBranch, plus kNotConverged where a root was not found; absent where not wanted
-  // On CUDA: whether this has nothing to do with an activation just before, and laws of other particles after that, so
-  // that it can run beside them.
+  // On CUDA: whether this is independent of the preceding activation and the following laws of other particles, so that
+  // it can run concurrently.
   bool runs_beside = false;
 };
 
@@ -97,10 +97,10 @@ struct LawBackwardArguments {
   LawArguments<T, D> law;
   Field<const T> grad_state, grad_stress, grad_history, grad_dissipated, grad_multiplier;  // each may be absent
   Field<T> state, C, parameters, history;  // adjoints per particle, parameters [P, n], history [P, m]; or absent
-  bool adds = false;                       // to what is there; of laws that change nothing
+  bool adds = false;                       // added to the present values; for laws without changes
 };
 
-// The derivative of the adjoints of the stress, along a direction in (state, C, parameters).
+// Derivative of the adjoints of the stress, along a direction in (state, C, parameters).
 template <class T, int D>
 struct LawDoubleBackwardArguments {
   LawArguments<T, D> law;
@@ -135,11 +135,11 @@ struct LawEnergyDoubleBackwardArguments {
   Field<T> state, parameters;
 };
 
-// The second derivative of the energy at a trial deformation (laws/tangent.h).
+// Second derivative of the energy at a trial deformation (laws/tangent.h).
 template <class T, int D>
 struct LawTangentArguments {
   LawArguments<T, D> law;
-  Field<const T> before;   // F₀ [P, D, D], or J₀ [P], from which the trial deformation moves
+  Field<const T> before;   // F₀ [P, D, D], or J₀ [P], the start of the trial deformation
   Field<const T> weight;   // [P]
   bool projected = false;  // whether it is made positive semi-definite
   Field<T> tangent;        // [P, kTangentEntries<D>]
@@ -154,15 +154,15 @@ constexpr int kHistory = int(Law::history.size());
 // Whether a law changes neither deformation nor history.
 template <class Law>
 constexpr bool kChangesNothing = !Law::plastic && kHistory<Law> == 0;
-// Length of arrays that hold it.
+// Length of arrays for it.
 template <class Law>
 constexpr int kHistoryLength = kHistory<Law> > 0 ? kHistory<Law> : 1;
 
 constexpr std::array<Quantity, 0> no_history = {};
 constexpr std::array<const char*, 0> no_options = {};
 
-// A parameter of the particles `at`. An absent particle, of a negative scene, has that of scene 0. A particle of a
-// scene without one has NaN.
+// Parameter of the particles `at`. An absent particle, of a negative scene, has that of scene 0. A particle of a scene
+// without one has NaN.
 template <class At, class T, int D>
 MPM_HD typename At::Value load_parameter(const At& at, const LawArguments<T, D>& a, int k) {
   const Parameter<T>& parameter = a.parameters[k];

@@ -13,7 +13,7 @@ Field<T> result(const Tensor& like, bool wanted, const Shape& shape, Tensor& out
   return field<T>(out);
 }
 
-// Bits of `details` and of `needs`, as torch_mpm/ops/law.py has them.
+// Bits of `details` and of `needs`, as in torch_mpm/ops/law.py.
 enum Detail : int64_t { kDissipated = 1, kMultiplier = 2, kBranch = 4 };
 enum Need : int64_t { kState = 1, kVelocityGradient = 2, kParameters_ = 4, kHistory_ = 8 };
 

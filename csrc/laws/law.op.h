@@ -5,7 +5,7 @@
 #include "common/backend.h"
 #include "laws/registry.h"
 
-// A law and its arguments as the ops take them.
+// A law and its arguments in the form of ops.
 namespace mpm {
 
 using Tensors = std::vector<Tensor>;
@@ -22,8 +22,8 @@ const LawKernels<T, D>& kernels_of(LawEntry& law) {
   return law.kernels<T, D>();
 }
 
-// The scenes that parameters may be given for: B where the call knows it; otherwise any number above the largest scene
-// of the particles. On CUDA that one is not known without waiting for the device (see `load_parameter`).
+// Number of scenes for parameters: B where the call knows it; otherwise any number above the largest scene of the
+// particles. On CUDA that one is unknown without waiting for the device (see `load_parameter`).
 class ParameterScenes {
  public:
   ParameterScenes(const OptionalTensor& scene, int64_t scenes) : scene_(scene), scenes_(scenes) {}
@@ -51,8 +51,8 @@ class ParameterScenes {
   }
 
   const OptionalTensor& scene_;
-  int64_t scenes_;      // negative where they are not known
-  int64_t least_ = -1;  // of the particles, where it is known
+  int64_t scenes_;      // negative where unknown
+  int64_t least_ = -1;  // scenes of the particles, where known
 };
 
 template <class T>
@@ -90,7 +90,7 @@ inline void check_number(const Tensors& given, const char* name, size_t expected
                   " tensors for the law ", law.name, ", got ", given.size());
 }
 
-// Entries of all history variables of a particle, of those that are given.
+// Entries of all given history variables of a particle.
 inline int64_t history_size(const LawInfo& law, const Tensors& history, int64_t dim) {
   int64_t size = 0;
   for (size_t k = 0; k < history.size() && k < law.history.size(); k++) size += law.history[k].matrix ? dim * dim : 1;
@@ -98,7 +98,7 @@ inline int64_t history_size(const LawInfo& law, const Tensors& history, int64_t 
 }
 
 // Where the number of scenes is unknown, the shortest parameter limits the entries of the elastic moduli, which come
-// first: a particle without a modulus is invalid, and one without a yield stress alone would be elastic.
+// first: a particle without a modulus is invalid, while one without only a yield stress would be elastic.
 template <class T, int D>
 void limit_scenes(LawArguments<T, D>& a, size_t count) {
   int64_t entries = 0;

@@ -36,7 +36,7 @@ struct NeoHookean : InvariantLaw {
 
   // Upper bound, over velocity gradients G with |G| = 1, of the second variation of ψ,
   //   μ |G F|² + a tr G² + λ (tr G)²  with a = μ − λ ln J,
-  // and of |dτ/dF : G F|, the tangent that a step sees before the particles have moved.
+  // and of |dτ/dF : G F|, the tangent of a step before the particles have moved.
   template <class T, int D>
   MPM_HD static T stiffness(const Strain<T, D>& s, const T p[]) {
     const T& mu = p[0];

@@ -5,16 +5,16 @@
 #include "laws/law.h"
 #include "laws/tangent.h"
 
-// Laws in principal strains: one decomposition of F, the map of the Hencky strains h, stress. Such a law gives
-//   flow(h, p, q)               the return map: moves the Hencky strains h and the history q of a particle with the
-//                               parameters p, and tells what happened (plastic laws only);
+// Laws in principal strains: one decomposition of F, the map of the Hencky strains h, stress. Such a law defines
+//   flow(h, p, q)               the return map: updates the Hencky strains h and the history q of a particle with the
+//                               parameters p, and returns the outcome (plastic laws only);
 //   map_quotient(...)           (Hᵢ − Hⱼ)/(hᵢ − hⱼ) of trial strains h and mapped strains H (plastic laws only);
 //   lost(h, H, p, before, q)    energy that the map from h to H, of the history from `before` to q, turns into heat per
-//                               rest volume: plastic work less what hardening stores (plastic laws only);
+//                               rest volume: plastic work minus the energy stored by hardening (plastic laws only);
 //   energy, stress, tangent     ψ(h), τᵢ = ∂ψ/∂hᵢ and ∂τ/∂h, at given history;
 //   stress_quotient(a, b)       (τᵢ − τⱼ)/(hᵢ − hⱼ) at hᵢ = a, hⱼ = b.
-// Its derivatives come from dual numbers: those of first order, and of second order of the energy alone. The map must
-// be continuous; on a boundary between branches its derivative is that of the branch which the comparison takes.
+// Its derivatives come from dual numbers: those of first order, and of second order of the energy only. The map must be
+// continuous; on a boundary between branches its derivative is that of the branch selected by the comparison.
 namespace mpm {
 inline namespace TORCH_MPM_ISA {
 
@@ -25,7 +25,7 @@ struct PrincipalLaw {
   static constexpr Deformation field = Deformation::gradient;
   static constexpr bool viscous = false, plastic = false, twice_differentiable = false, optional_history = false,
                         in_2d = true;
-  static constexpr bool twice_differentiable_energy = false;  // history counts as constant
+  static constexpr bool twice_differentiable_energy = false;  // history is constant
   static constexpr bool has_tangent = true, additive = false;
   static constexpr auto history = no_history;
   static constexpr auto options = no_options;
@@ -35,7 +35,7 @@ struct PrincipalLaw {
   using Kernels = PrincipalKernels<Law>;
 };
 
-// What a return map did: the factor of the deviator (radial maps), and where it is not the identity.
+// Outcome of a return map: the factor of the deviator (radial maps), and where it is not the identity.
 template <class T>
 struct Flow {
   T kappa;
@@ -113,8 +113,8 @@ template <class T, int N>
 struct NewtonTolerance<Pack<T, N>> : NewtonTolerance<T> {};
 #endif
 
-// τ(H) · (h − H): the work of a plastic step by backward Euler (Simo and Hughes 1998). ψ(h) − ψ(H) is more, by what the
-// stress of the trial strain beyond the yield surface would do, which no step has done.
+// τ(H) · (h − H): the work of a plastic step by backward Euler (Simo and Hughes 1998). ψ(h) − ψ(H) exceeds it by the
+// work of the stress beyond the yield surface, which no step has done.
 template <class T, int D>
 MPM_HD T plastic_work(const Vector<T, D>& tau, const Vector<T, D>& h, const Vector<T, D>& H) {
   T r = T(0);
@@ -140,7 +140,7 @@ MPM_HD PrincipalData<Law, typename At::Value> load_data(const At& at, const LawA
   return r;
 }
 
-// What a law makes of a trial strain.
+// Result of a law for a trial strain.
 template <class Law, class T, int D>
 struct Response {
   Vector<T, D> h, tau;
@@ -190,10 +190,10 @@ MPM_HD PlasticIncrement<T, D> plastic_increment(const Vector<T, D>& h, const Vec
   return {norm, (T(1) / select(norm > T(0), norm, T(1))) * lost};
 }
 
-// Adjoints of what a law takes, from forward derivatives: `derivative(h, data)` gives the sum of the adjoints of the
-// results times their derivatives in the direction that its arguments carry. It is asked once per strain, parameter and
-// history variable that is wanted; `parameter(k, value)` and `history(k, value)` take theirs, those of the strains are
-// returned.
+// Adjoints of the inputs of a law, from forward derivatives: `derivative(h, data)` returns the sum of the adjoints of
+// the results times their derivatives in the direction of its arguments. It is evaluated once per requested strain,
+// parameter and history variable; `parameter(k, value)` and `history(k, value)` receive theirs, those of the strains
+// are returned.
 template <class Law, class V, int D, class F, class StoreParameter, class StoreHistory>
 MPM_HD Vector<V, D> differentiate(const Vector<V, D>& h, const PrincipalData<Law, V>& data, bool parameters,
                                   bool history, const StoreParameter& store_parameter,
@@ -245,7 +245,7 @@ MPM_HD PrincipalGrads<Law, typename At::Value, D> load_grads(const At& at, const
   return r;
 }
 
-// The adjoint of F through the map and its stress; those of parameters and history go to where `differentiate` says.
+// Adjoint of F through the map and its stress; those of parameters and history are stored by `differentiate`.
 template <class Law, class V, int D, class StoreParameter, class StoreHistory>
 MPM_HD Matrix<V, D> map_adjoint(const HenckyStrain<V, D>& s, const PrincipalData<Law, V>& data,
                                 const Response<Law, V, D>& r, const PrincipalGrads<Law, V, D>& grad, bool parameters,
@@ -278,7 +278,7 @@ MPM_HD Matrix<V, D> map_adjoint(const HenckyStrain<V, D>& s, const PrincipalData
   return s.U * principal * transpose(right);
 }
 
-// The adjoint of F through the energy, likewise.
+// Adjoint of F through the energy, likewise.
 template <class Law, class V, int D, class StoreParameter, class StoreHistory>
 MPM_HD Matrix<V, D> energy_adjoint(const HenckyStrain<V, D>& s, const PrincipalData<Law, V>& data, const V& grad,
                                    bool parameters, bool history, const StoreParameter& store_parameter,
@@ -293,8 +293,8 @@ MPM_HD Matrix<V, D> energy_adjoint(const HenckyStrain<V, D>& s, const PrincipalD
   return compose(s.U, diagonal, right_axes(s));
 }
 
-// The derivative of P = τ F⁻ᵀ = U diag(τᵢ/σᵢ) Vᵀ along A, in principal axes: M = Uᵀ A V, and `tau` carries the
-// derivatives of the stresses along it. Off the diagonal stand the moduli of shear of laws/tangent.h.
+// Derivative of P = τ F⁻ᵀ = U diag(τᵢ/σᵢ) Vᵀ along A, in principal axes: M = Uᵀ A V, and `tau` carries the derivatives
+// of the stresses along it. The off-diagonal entries are the shear moduli of laws/tangent.h.
 template <class Law, class V, int D>
 MPM_HD Matrix<V, D> stress_derivative(const HenckyStrain<V, D>& s, const PrincipalData<Law, V>& data,
                                       const Vector<Dual<V>, D>& h, const Vector<Dual<V>, D>& tau,
@@ -317,7 +317,7 @@ MPM_HD Matrix<V, D> stress_derivative(const HenckyStrain<V, D>& s, const Princip
   return r;
 }
 
-// ∂τ/∂h of the energy's own stress, without the return map.
+// ∂τ/∂h of the stress of the energy, without the return map.
 template <class Law, class V, int D>
 MPM_HD Matrix<V, D> principal_moduli(const Vector<V, D>& h, const PrincipalData<Law, V>& data, Vector<V, D>& tau) {
   PrincipalData<Law, Dual<V>> constant_data;
@@ -379,7 +379,7 @@ MPM_HD T wave_modulus_bound(const Response<Law, T, D>& r, const PrincipalData<La
   return largest;
 }
 
-// The bodies of the kernels.
+// Bodies of the kernels.
 template <class Law>
 struct PrincipalKernels {
   template <class At, class T, int D>
@@ -471,7 +471,7 @@ struct PrincipalKernels {
     store_tangent(at, a.tangent, s.valid, t);
   }
 
-  // Of g ψ(F, p) along a direction: the derivatives of g ∂ψ/∂F and g ∂ψ/∂p, and that of ψ, which is by g.
+  // For g ψ(F, p) along a direction: the derivatives of g ∂ψ/∂F and g ∂ψ/∂p, and that of ψ, which is by g.
   template <class At, class T, int D>
   MPM_HD static void energy_double_backward(const LawEnergyDoubleBackwardArguments<T, D>& a, const At& at) {
     using V = typename At::Value;

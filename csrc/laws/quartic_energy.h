@@ -14,8 +14,7 @@ inline namespace TORCH_MPM_ISA {
 
 constexpr double kQuarticCoefficient = 6.254421582537118;
 
-// An energy, and the one that the yield surface is drawn with where it is another. The flow is radial unless
-// exact_flow.
+// An energy, and the energy of the yield surface where it differs. The flow is radial unless exact_flow.
 template <bool Quadratic, bool UnilateralStress, bool UnilateralYield>
 struct SandEnergy {
   static constexpr bool quadratic = Quadratic, unilateral_stress = UnilateralStress, unilateral_yield = UnilateralYield;
@@ -25,8 +24,8 @@ struct SandEnergy {
 struct FullQuartic : SandEnergy<false, false, false> {};
 struct UnilateralQuartic : SandEnergy<false, true, true> {};
 struct Quadratic : SandEnergy<true, false, false> {};
-// Returned to the yield surface of the full energy, stress of the unilateral one, as in the program published by Gao et
-// al.
+// Return map to the yield surface of the full energy, stress of the unilateral one, as in the program published by Gao
+// et al.
 struct MixedQuartic : SandEnergy<false, true, false> {};
 
 template <class Energy>
@@ -109,7 +108,7 @@ MPM_HD T cube_quotient(const T& a, const T& b) {
   const T c = one_sided<Unilateral>(a), d = one_sided<Unilateral>(b);
   const T full = c * c + c * d + d * d;
   if constexpr (!Unilateral) return full;
-  // (c − d)/(a − b): 1 where both are negative, 0 where none is.
+  // (c − d)/(a − b): 1 where both are negative, 0 where neither is.
   const T difference = a - b;
   const auto same = difference == T(0);
   return full * select(same, T(1), (c - d) / select(same, T(1), difference));

@@ -40,7 +40,7 @@ MPM_HD T tangent_of_lode_angle(const Vector<T, 3>& n) {
   return max(T(0), T(-0.57735026918962576) * (most + T(2) * least) / most);
 }
 
-// A step of Newton's method: turn of m, change of r. `value` and `slope` are g/|d| and its derivative along the
+// Step of Newton's method: rotation of m, change of r. `value` and `slope` are g/|d| and its derivative along the
 // surface.
 template <class T>
 struct FlowStep {
@@ -103,7 +103,7 @@ MPM_HD_LARGE FlowRoot<T> flow_root(const Root<T>& start, T u, T near, const Vect
     low = select(near > T(0), low, select(before, u, low));
     high = select((near > T(0)) | before, high, u);
     const T next = u + g.turn * square, size = abs(g.turn) + abs(g.change) / f.r;
-    // Where the root is so ill-conditioned that rounding keeps the steps larger, the last of them may be.
+    // Where rounding keeps the steps of an ill-conditioned root larger, the last of them may be.
     const auto small = size <= T(tolerance * (step + 5 < RootFinding<T>::most_steps ? 1 : 300));
     const auto inside = (next >= low) & (next <= high);
     // A bracket that cannot be halved further may still leave r open.

@@ -2,7 +2,7 @@
 
 #include "laws/quartic_flow.h"
 
-// Return to the Drucker-Prager cone y = |dev τ| + α tr τ ≤ 0 in Hencky strains, with the trace of the strain kept.
+// Return to the Drucker-Prager cone y = |dev τ| + α tr τ ≤ 0 in Hencky strains, at constant trace of the strain.
 //
 // The map is radial: h = p + r |p| n with p = tr h/D < 0 and the unit trial deviator n (supplement, equation 28); or it
 // has the exact flow rule, which is the same in 2-D and for the quadratic energy.
@@ -17,7 +17,7 @@ struct MappedStrain {
   Vector<T, D> direction;  // its unit deviator
   T p, radius, kappa;      // mean strain; |dev h|/|p|; the factor of the deviator if radial
   T x, b;                  // of the exact flow, see laws/quartic_flow.h
-  T steps;                 // evaluations of the yield function by the root finding
+  T steps;                 // number of evaluations of the yield function by the root finding
   MaskOf<T> cone, apex, converged;
 };
 
@@ -62,8 +62,7 @@ MPM_HD MaskOf<T> outside(const T& r, const Vector<T, D>& n, const Cone<T>& cone)
   return convert<MaskOf<T>>(y > Rough(0));
 }
 
-// The root of y below r = `most`. Where Rough is a type of fewer digits the steps there are taken in it, all but the
-// last.
+// Root of y below r = `most`. Where Rough is a type of fewer digits all steps except the last are computed in it.
 template <class Energy, class Rough, class T, int D>
 MPM_HD Root<T> radial_root(const T& most, const Vector<T, D>& n, const Cone<T>& cone, const MaskOf<T>& wanted) {
   constexpr double tolerance = RootFinding<Rough>::tolerance;
@@ -121,8 +120,8 @@ MPM_HD FlowRoot<T> exact_root(const Root<T>& radial, const Vector<T, 3>& n, cons
   return f;
 }
 
-// `keep` chooses between the two apex rules: all strain is lost, or the volume is kept (unilateral energy only).
-// Without shear stiffness there is no cone. What is torn is at the apex in all extension. Rough: see radial_root.
+// `keep` chooses between the two apex rules: all strain is lost, or the volume is preserved (unilateral energy only).
+// Without shear stiffness there is no cone. Torn sand is at the apex in all extension. Rough: see radial_root.
 template <class Energy, class Rough, class T, int D>
 MPM_HD MappedStrain<T, D> return_map(const Vector<T, D>& h, const Cone<T>& cone, const MaskOf<T>& shear,
                                      const MaskOf<T>& torn, bool keep) {
@@ -164,7 +163,7 @@ MPM_HD MappedStrain<T, D> return_map(const Vector<T, D>& h, const Cone<T>& cone,
 }
 
 // (Hᵢ − Hⱼ)/(hᵢ − hⱼ) of mapped strains H of trial strains h, also where these are equal. `trial` is hᵢ − hⱼ.
-// Differences are taken in T, their quotient in V.
+// Differences are computed in T, their quotient in V.
 template <class Energy, class V, class T, int D>
 MPM_HD V strain_quotient(const MappedStrain<T, D>& m, int i, int j, const T& trial) {
   T on_cone = m.kappa;
@@ -173,7 +172,7 @@ MPM_HD V strain_quotient(const MappedStrain<T, D>& m, int i, int j, const T& tri
     on_cone = m.x / (m.x + m.b * cube_quotient<Energy::unilateral_yield>(a, b));
     on_cone = select(m.cone, on_cone, T(1));
   }
-  // At the apex 1 between strains that are kept, 0 between those that are not.
+  // At the apex 1 between preserved strains, 0 between those that are not.
   const V before = convert<V>(trial), after = convert<V>(m.h[i] - m.h[j]);
   const auto equal = before == V(0);
   const MaskOf<T> both = (m.h[i] > T(0)) & (m.h[j] > T(0));
@@ -182,16 +181,16 @@ MPM_HD V strain_quotient(const MappedStrain<T, D>& m, int i, int j, const T& tri
 }
 
 // Adjoint of `return_map`: from that of the mapped strain to those of the trial strain, α and Λ, by the implicit
-// function theorem at the root. On a boundary between branches it is the derivative of the branch that was taken.
+// function theorem at the root. On a boundary between branches it is the derivative of the selected branch.
 template <class T, int D>
 struct MapAdjoint {
   Vector<T, D> h;
   T alpha, ratio;
 };
 
-// Aᵀ⁻¹ a of the flow rule A dH = dh − d db with the yield surface left aside: A = κ⁻¹ in the deviators if radial, and
-// I + b/x dev diag(∂q/∂s) if exact. As mean + scale deviator, whose mean is another than that of a if exact: x may be
-// far below the rounding of the mean.
+// Aᵀ⁻¹ a of the flow rule A dH = dh − d db without the yield surface: A = κ⁻¹ in the deviators if radial, and I + b/x
+// dev diag(∂q/∂s) if exact. As mean + scale deviator, whose mean differs from that of a if exact: x may be far below
+// the rounding of the mean.
 template <class T, int D>
 struct PulledBack {
   T mean, scale;
@@ -243,7 +242,7 @@ MPM_HD_LARGE MapAdjoint<T, D> return_map_adjoint(const MappedStrain<T, D>& m, co
     across = select(sheared, dot(d, normal.deviator), across);
   }
   const T step = quotient(along, select(m.cone, across, T(1)));
-  // The share of the other strains where the volume is kept: dHᵢ = dhᵢ + Σ_{dropped} dh/#kept.
+  // Share of the other strains where the volume is preserved: dHᵢ = dhᵢ + Σ_{dropped} dh/#kept.
   T positive = T(0), share = T(0);
   MPM_UNROLL for (int i = 0; i < D; i++) {
     const auto remains = m.h[i] > T(0);

@@ -111,9 +111,9 @@ struct Root {
   MaskOf<T> converged;
 };
 
-// The root of y in [0, most] from a guess `start` in it, where y(most) > 0: Newton's method, where y > 0 on
-// ∛(y + c) − ∛c with c = αK + 1, nearly linear in r for any overshoot, kept in a bracket by bisection, until a step is
-// at most `tolerance` of r. Lanes are independent of each other: each stops when it has converged.
+// Root of y in [0, most] from an initial guess `start`, where y(most) > 0: Newton's method, where y > 0 on ∛(y + c) −
+// ∛c with c = αK + 1, nearly linear in r for any overshoot, kept in a bracket by bisection, until a step is at most
+// `tolerance` of r. Lanes are independent: each stops when it has converged.
 template <class Energy, class T, int D>
 MPM_HD_LARGE Root<T> yield_root(const T& start, const T& most, const Vector<T, D>& n, const Cone<T>& cone,
                                 const MaskOf<T>& wanted, double tolerance) {
@@ -134,7 +134,7 @@ MPM_HD_LARGE Root<T> yield_root(const T& start, const T& most, const Vector<T, D
     // 3 (w0 − w) w²/y' with w0 − w = −y/(w² + w w0 + w0²), which does not cancel.
     const T change = T(-3) * y.value * w * w / ((w * w + w * w0 + w0 * w0) * y.slope), next = r + change;
     const auto small = abs(change) <= T(tolerance) * r;
-    // At a multiple root, where the step says nothing, y vanishes to rounding.
+    // At a multiple root, where the step has no meaning, y vanishes to rounding.
     const auto settled = abs(y.value) <= T(RootFinding<T>::rounding) * y.size;
     const auto good = (y.slope > T(0)) & (((next >= low) & (next <= high)) | small);
     const T other = select(settled, r, T(0.5) * (low + high));

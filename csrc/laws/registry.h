@@ -8,8 +8,8 @@
 #include "rollout/persistent.h"
 #include "rollout/resident.h"
 
-// The laws that were compiled, with their kernels: the only list of them. Each object file of laws/law.cpu.cpp and
-// laws/law.cu enters its laws when the library is loaded; ops find them by name, and Python reads the whole list.
+// Registry of the compiled laws with their kernels. Each object file of laws/law.cpu.cpp and laws/law.cu registers its
+// laws when the library is loaded; ops find them by name, and Python reads the whole list.
 namespace mpm {
 
 struct LawInfo {
@@ -23,7 +23,7 @@ struct LawInfo {
   bool changes() const { return plastic || !history.empty(); }  // deformation or history
 };
 
-// Of one scalar and dimension; the stream is that of CUDA, or null. Kernels that a law has not are null.
+// For one scalar and dimension; the stream is that of CUDA, or null. Missing kernels of a law are null.
 template <class T, int D>
 struct LawKernels {
   void (*update)(const LawUpdateArguments<T, D>&, void* stream) = nullptr;
@@ -32,14 +32,14 @@ struct LawKernels {
   void (*scalar)(const LawScalarArguments<T, D>&, void* stream) = nullptr;
   void (*energy_backward)(const LawEnergyBackwardArguments<T, D>&, void* stream) = nullptr;
   void (*energy_double_backward)(const LawEnergyDoubleBackwardArguments<T, D>&, void* stream) = nullptr;
-  // Motion of F or J, update and P2G in one, the stress in registers: of quadratic weights and the MLS form, on CUDA.
+  // Update of F or J, law and P2G in one, the stress in registers: for quadratic weights and the MLS form, on CUDA.
   void (*p2g)(const LawUpdateArguments<T, D>&, const LateDeformation<T, D>&, const P2GArguments<T, D>&,
               const Settling<T, D>&, void* stream) = nullptr;
-  // G2P and the P2G after it in one.
+  // G2P and the next P2G in one.
   void (*g2p2g)(const LawUpdateArguments<T, D>&, const G2P2GArguments<T, D>&, void* stream) = nullptr;
-  // Substeps of few particles, of quadratic weights and the MLS form, on CUDA 13.
+  // Substeps of few particles, for quadratic weights and the MLS form, on CUDA 13.
   void (*persistent)(const LawUpdateArguments<T, D>&, const PersistentArguments<T, D>&, void* stream) = nullptr;
-  // All substeps of small scenes, of quadratic weights and the MLS form, on CUDA.
+  // All substeps of small scenes, for quadratic weights and the MLS form, on CUDA.
   void (*resident)(const LawUpdateArguments<T, D>&, const ResidentArguments<T, D>&, void* stream) = nullptr;
   void (*tangent)(const LawTangentArguments<T, D>&, void* stream) = nullptr;
 };
@@ -68,13 +68,13 @@ struct LawEntry {
   }
 };
 
-// Enters a law, or more kernels of one that is there.
+// Registers a law, or further kernels of a registered one.
 LawEntry& enter_law(const LawInfo& info, int level);
 
-// Null where there is none of this name for the instruction set in use.
+// Null where the name is unknown for the instruction set in use.
 LawEntry* find_law(const std::string& name);
 
-// As Python reads it.
+// In the form that Python reads.
 std::string laws_as_json();
 std::string law_names();
 

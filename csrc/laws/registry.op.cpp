@@ -10,7 +10,7 @@
 namespace mpm {
 namespace {
 
-// Not yet constructed when the first law is entered, were it not in a function.
+// In a function, since a global would not yet be constructed when the first law is registered.
 std::deque<LawEntry>& entered() {
   static std::deque<LawEntry> laws;
   return laws;

@@ -5,9 +5,9 @@
 
 // Sand as a law: one decomposition, the return map of the principal strains, and its adjoint.
 //
-// With a volume correction (Tampubolon et al. 2017) what reaches the apex is torn: it loses all strain, cohesion
-// included, and remembers the logarithm v_c of the volume. Until compression has closed that gap it has no stress and
-// no cohesion: it sees its trial strain h as h + v_c/D, and is at the apex while tr h + v_c ≥ 0.
+// With a volume correction (Tampubolon et al. 2017) sand at the apex is torn: it loses all strain, cohesion included,
+// and stores the logarithm v_c of the volume. Until compression has closed that gap it has no stress and no cohesion:
+// the map uses the trial strain h + v_c/D, and sand is at the apex while tr h + v_c ≥ 0.
 namespace mpm {
 inline namespace TORCH_MPM_ISA {
 
@@ -26,10 +26,10 @@ struct Sand : PrincipalLaw {
   static constexpr std::array history = {real("volume_correction", "")};
   static constexpr bool plastic = true, optional_history = true, in_2d = !Energy::exact_flow;
   static constexpr bool twice_differentiable_energy = true;
-  // keep_apex: see return_map; elastic: F is kept.
+  // keep_apex: see return_map; elastic: F is unchanged.
   static constexpr std::array options = {"keep_apex", "elastic"};
-  // Those of the update matter to the exact flow alone, whose rare roots in float64 would take as many registers as
-  // they need; the backward would lose a third of its time with 190.
+  // Those of the update affect only the exact flow, whose rare roots in float64 would need as many registers; the
+  // backward would lose a third of its time with 190.
   static constexpr int gpu_update_blocks = 5, gpu_backward_blocks = 4;
   template <class Law>
   using Kernels = SandKernels<Law>;
@@ -53,12 +53,12 @@ struct Sand : PrincipalLaw {
 template <class T>
 struct SandParameters {
   T mu, lam, alpha;
-  T cohesion, volume;  // the cohesion of what is torn is 0
+  T cohesion, volume;  // the cohesion of torn sand is 0
   Cone<T> cone;
   MaskOf<T> shear, torn;  // μ > 0; v_c > 0 where the apex loses volume
 };
 
-// Whether the apex keeps the volume: nothing tears.
+// Whether the apex preserves the volume: nothing tears.
 template <class Energy, class T, int D>
 MPM_HD bool keeps_volume(const LawArguments<T, D>& a) {
   return Energy::unilateral_yield && (a.options & kKeepApex);
@@ -94,7 +94,7 @@ MPM_HD MappedStrain<T, D> unmapped(const Vector<T, D>& h) {
   return {h, zero, T(0), T(0), T(1), T(0), T(0), T(0), none, none, T(0) == T(0)};
 }
 
-// What a particle becomes, in principal axes.
+// Result at a particle, in principal axes.
 template <class T, int D>
 struct SandState {
   MappedStrain<T, D> m;    // relative to the apex of the cone
@@ -123,11 +123,11 @@ MPM_HD_LARGE SandState<V, D> sand_state(const HenckyStrain<V, D>& s, const SandP
   return r;
 }
 
-// The energy that turns into heat, ψ(x) − ψ(H) + τ(x) · (h − x): plastic flow from the trial strain h under the stress
-// at the strain x where it yields (backward Euler; Simo and Hughes 1998), and what is stored there and not in the
-// mapped strain H. x is H but for two jumps: what tears does so at the cohesion, and the compressed axes of a
-// unilateral energy lose theirs at the apex, which a steep cone reaches at any strain. Never negative, and zero where
-// no stress is.
+// Energy that turns into heat, ψ(x) − ψ(H) + τ(x) · (h − x): plastic flow from the trial strain h under the stress at
+// the strain x where it yields (backward Euler; Simo and Hughes 1998), and the energy stored there and not in the
+// mapped strain H. x is H except for two jumps: sand tears at the cohesion, and the compressed axes of a unilateral
+// energy lose their energy at the apex, which a steep cone reaches at any strain. Never negative, and zero without
+// stress.
 template <class T, int D>
 struct Dissipation {
   Vector<T, D> at, flow;  // x, h − x
@@ -152,7 +152,7 @@ MPM_HD T dissipated_energy(const Dissipation<T, D>& d, const Vector<T, D>& mappe
          dot(sand_stress<Energy>(d.at, mu, lam), d.flow);
 }
 
-// A value per particle where the mask is true, else 0.
+// Value per particle where the mask is true, otherwise 0.
 template <class V, class At, class T>
 MPM_HD V load_where(const At& at, const Field<const T>& f, const MaskOf<V>& mask) {
   return select(mask, convert<V>(at.load(f.pointer, f.stride[0])), V(0));
@@ -165,7 +165,7 @@ struct SandAdjoint {
   T mu, lam, alpha, cohesion, volume;
 };
 
-// Of F and stress, by the diagonals M and N of their adjoints in principal axes. Exponentials have no small
+// Adjoints of F and stress, by the diagonals M and N of their adjoints in principal axes. Exponentials have no small
 // differences.
 template <class Energy, class Narrow, class T, int D>
 MPM_HD SandAdjoint<T, D> adjoint_of_tensors(const SandState<T, D>& state, const SandParameters<T>& p,
@@ -200,7 +200,7 @@ MPM_HD void add_adjoint_of_dissipation(SandAdjoint<T, D>& r, const T& g, const H
   r.lam = r.lam + g * dissipated_energy<Energy>(d, state.h, T(0), T(1));
 }
 
-// Of the scalar results that are asked for.
+// Adjoints of the requested scalar results.
 template <class Energy, class At, class T, class V, int D>
 MPM_HD void add_adjoint_of_scalars(SandAdjoint<V, D>& r, const LawBackwardArguments<T, D>& a, const At& at,
                                    const HenckyStrain<V, D>& s, const SandState<V, D>& state,
@@ -241,7 +241,7 @@ MPM_HD Vector<T, D> diagonal(const Matrix<T, D>& a) {
   return r;
 }
 
-// The bodies of the kernels that differ from those of other laws in principal strains.
+// Bodies of the kernels that differ from those of other laws in principal strains.
 template <class Law>
 struct SandKernels : PrincipalKernels<Law> {
   using Energy = typename Law::Energy;
@@ -272,13 +272,13 @@ struct SandKernels : PrincipalKernels<Law> {
       const V lost = dissipated_energy<Energy>(dissipation<Energy>(s, state, p), state.h, p.mu, p.lam);
       at.store(a.dissipated.pointer, a.dissipated.stride[0], select(state.moved, lost, V(0)));
     }
-    // What the trace loses: on the cone and where the volume is kept, nothing.
+    // Loss of the trace: on the cone and where the volume is preserved, none.
     if (a.history.pointer)
       store_entry(at, a.history, 0, select(state.valid, select(state.tears, p.volume + sum(s.h), V(0)), p.volume));
   }
 
-  // The strains, their map and its adjoint in W, the axes in V: of float32 arguments in float64 and float32, because a
-  // relative error of the mean strain grows with the strains over their mean, but that of the axes does not.
+  // The strains, their map and its adjoint in W, the axes in V: for float32 arguments in float64 and float32, because a
+  // relative error of the mean strain grows with the ratio of the strains to their mean, but that of the axes does not.
   template <class At, class T, int D>
   MPM_HD static void update_backward(const LawBackwardArguments<T, D>& a, const At& at) {
     using V = typename At::Value;
@@ -289,7 +289,7 @@ struct SandKernels : PrincipalKernels<Law> {
     const HenckyStrain<W, D> wide = wide_hencky_strain(F);
     const Matrix<W, D> wide_right = right_axes(wide), M = transpose(wide.U) * (convert<W>(grad_F) * wide_right),
                        N = transpose(wide.U) * (symmetric_part(convert<W>(grad_stress)) * wide.U);
-    // Before the map, whose registers these take no longer.
+    // Before the map, so that these registers are free in it.
     const HenckyStrain<V, D> s = convert<V>(wide);
     const Matrix<V, D> right = convert<V>(wide_right), even = convert<V>(symmetric_part(M)),
                        odd = convert<V>(skew_part(M)), narrow_N = convert<V>(N);

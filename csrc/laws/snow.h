@@ -38,8 +38,8 @@ struct Snow : FixedCorotatedElasticity {
     return select(equal, select(h[i] == H[i], T(1), T(0)), (H[i] - H[j]) / select(equal, T(1), trial));
   }
 
-  // Hardening stores what it adds to the elastic energy. The clamp may raise the volumetric energy by more than it
-  // lowers the other: that counts as nothing.
+  // Hardening stores the energy that it adds to the elastic energy. The clamp may raise the volumetric energy by more
+  // than it lowers the other: the sum is then zero.
   template <class T, int D>
   MPM_HD static T lost(const Vector<T, D>& h, const Vector<T, D>& H, const T p[], const T before[], const T q[]) {
     const T stored = energy(H, p, q) - energy(H, p, before);

@@ -3,8 +3,8 @@
 #include "common/dual.h"
 #include "common/matrix.h"
 
-// What an isotropic law without principal values knows of one particle. Every quantity that vanishes at rest is kept as
-// a difference from rest, so that small strains lose no digits to the 1 in F Fᵀ and J.
+// Strain of one particle for an isotropic law without principal values. Every quantity that vanishes at rest is stored
+// as a difference from rest, so that small strains lose no digits to the 1 in F Fᵀ and J.
 namespace mpm {
 inline namespace TORCH_MPM_ISA {
 

@@ -3,11 +3,11 @@
 #include "common/lanes.h"
 #include "laws/hencky_strain.h"
 
-// The second derivative of the energy ψ of an isotropic solid, as a linear map of velocity gradients L: with a trial
-// deformation F = U diag(σ) Vᵀ that moves with dF = L F₀,
+// Second derivative of the energy ψ of an isotropic solid, as a linear map of velocity gradients L: for a trial
+// deformation F = U diag(σ) Vᵀ that changes by dF = L F₀,
 //   L ↦ dP F₀ᵀ = U (∂P̂/∂F̂ : M) Bᵀ,   M = Uᵀ L B,   B = F₀ V.
-// In these axes ∂P̂/∂F̂ is a symmetric block between the diagonal entries of M, and on each pair Mᵢⱼ, Mⱼᵢ one number for
-// their sum and one for their difference (Teran et al. 2005; Ogden 1997, section 6.1.4).
+// In these axes ∂P̂/∂F̂ is a symmetric block between the diagonal entries of M, and on each pair Mᵢⱼ, Mⱼᵢ one number
+// for their sum and one for their difference (Teran et al. 2005; Ogden 1997, section 6.1.4).
 namespace mpm {
 
 template <int D>
@@ -87,7 +87,7 @@ MPM_HD Matrix<T, D> node_block(const Tangent<T, D>& t, const Vector<T, D>& a) {
 }
 
 // (Pᵢ − Pⱼ)/(σᵢ − σⱼ) and (Pᵢ + Pⱼ)/(σᵢ + σⱼ), both times σᵢσⱼ, of Pᵢ = τᵢ/σᵢ: with half the difference of the strains,
-// the mean of the stresses and their quotient (τᵢ − τⱼ)/(hᵢ − hⱼ), so that equal stretches are no exception.
+// the mean of the stresses and their quotient (τᵢ − τⱼ)/(hᵢ − hⱼ), so that equal stretches need no special case.
 template <class T>
 struct ShearModuli {
   T even, odd;
@@ -99,8 +99,8 @@ MPM_HD ShearModuli<T> shear_moduli(const T& half, const T& mean, const T& quotie
   return {quotient * of.cosh / of.sinhc - mean, mean - quotient * half * half * of.sinhc / of.cosh};
 }
 
-// A symmetric matrix without its negative eigenvalues. Shifted by its norm it has no others than positive ones, and
-// these are its singular values.
+// Symmetric matrix without its negative eigenvalues. Shifted by its norm it has only positive ones, which are its
+// singular values.
 template <class T, int D>
 MPM_HD Matrix<T, D> positive_part(const Matrix<T, D>& a) {
   const T scale = scale_of(a);

@@ -6,16 +6,16 @@
 namespace mpm {
 inline namespace TORCH_MPM_ISA {
 
-// The Maxwell branch of a viscoelastic solid in the Hencky strains of its elastic deformation F_e = F F_v⁻¹:
-// ψ = μ_v |dev h|², so τ = 2μ_v dev h, and dh/dt = −dev h/T of the viscous flow, with T = η/μ_v (Reese and Govindjee
-// 1998, equation 38, with a volume that flows not at all). Backward Euler with the exponential map, which is closed:
-// dev H = dev h/(1 + Δt/T).
+// Maxwell branch of a viscoelastic solid in the Hencky strains of its elastic deformation F_e = F F_v⁻¹: ψ = μ_v |dev
+// h|², so τ = 2μ_v dev h, and dh/dt = −dev h/T of the viscous flow, with T = η/μ_v (Reese and Govindjee 1998, equation
+// 38, with a volume that does not flow). Backward Euler with the exponential map, which is closed: dev H = dev h/(1 +
+// Δt/T).
 struct MaxwellBranch : PrincipalLaw {
   static constexpr std::array parameters = {not_negative("branch_modulus", "Pa"), positive("relaxation_time", "s"),
                                             time_step};
   static constexpr bool plastic = true;
 
-  // What flows of the deviator, without the difference of h and H.
+  // Flow of the deviator, without the difference of h and H.
   template <class T>
   MPM_HD static T share(const T p[]) {
     return p[2] / (p[1] + p[2]);
@@ -35,7 +35,7 @@ struct MaxwellBranch : PrincipalLaw {
 
   template <class T, int D>
   MPM_HD static T lost(const Vector<T, D>& h, const Vector<T, D>& H, const T p[], const T[], const T q[]) {
-    return share(p) * dot(stress(H, p, q), h);  // of which the mean does no work
+    return share(p) * dot(stress(H, p, q), h);  // its mean does no work
   }
 
   template <class T, int D>
@@ -74,8 +74,8 @@ struct MaxwellBranch : PrincipalLaw {
 template <class Law>
 struct ViscoelasticKernels;
 
-// Neo-Hookean solid with a Maxwell branch beside it. F itself is kept; the flow is in F_v⁻¹, whose difference from the
-// identity is the history, zero at first.
+// Neo-Hookean solid with a parallel Maxwell branch. F itself is unchanged; the flow is in F_v⁻¹, whose difference from
+// the identity is the history, zero at first.
 struct Viscoelastic : PrincipalLaw {
   static constexpr const char* name = "viscoelastic";
   static constexpr std::array parameters = {NeoHookean::parameters[0], NeoHookean::parameters[1],
@@ -114,7 +114,7 @@ struct ViscoelasticKernels {
     return (V(1) / determinant(F)) * transpose(cofactor(F));
   }
 
-  // Branch strains, response and validity, of all of it.
+  // Branch strains, response and validity of the whole.
   template <class V, int D>
   struct State {
     HenckyStrain<V, D> s;
@@ -155,7 +155,7 @@ struct ViscoelasticKernels {
     const Parts<V, D> p = load(at, a.law);
     const State<V, D> state = respond_to(p);
     store_matrix<D>(at, a.stress, select(state.valid, state.stress, zero_matrix<V, D>()));
-    // F_v⁻¹ changes by F⁻¹ U diag(exp(H − h) − 1) Uᵀ F_e, which keeps the digits of a slow flow.
+    // F_v⁻¹ changes by F⁻¹ U diag(exp(H − h) − 1) Uᵀ F_e, which preserves the digits of a slow flow.
     const V share = MaxwellBranch::share(p.branch.parameters), mean = V(1.0 / D) * sum(state.s.h);
     Vector<V, D> rate;
     MPM_UNROLL for (int i = 0; i < D; i++)
@@ -172,8 +172,8 @@ struct ViscoelasticKernels {
     if (a.branch) at.store_integer(a.branch, select(state.valid, branch, V(kInvalidFlow)));
   }
 
-  // By F_e = F F_v⁻¹ of the branch and by F of the solid; then F_v⁻¹ after the flow is F⁻¹ F_e, whose adjoint is that
-  // of F_e once more and −F⁻ᵀ Ḡ Gᵀ of F.
+  // By F_e = F F_v⁻¹ of the branch and by F of the solid; then F_v⁻¹ after the flow is F⁻¹ F_e, whose adjoint adds to
+  // that of F_e, and −F⁻ᵀ Ḡ Gᵀ to that of F.
   template <class At, class T, int D>
   MPM_HD static void update_backward(const LawBackwardArguments<T, D>& a, const At& at) {
     using V = typename At::Value;

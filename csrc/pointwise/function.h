@@ -3,12 +3,12 @@
 #include "common/dual.h"
 #include "common/lanes.h"
 
-// Functions of a particle (or node): a few entries in, a few entries out, and nothing of its neighbours. Each is
-// written once, for any scalar: its derivatives are those of dual numbers, one evaluation for each entry that they are
-// wanted by.
+// Functions of a particle (or node): a few input entries and a few output entries, independent of its neighbours. Each
+// is written once, for any scalar: its derivatives are those of dual numbers, one evaluation for each requested input
+// entry.
 namespace mpm {
 
-// Entries of an argument or result in a row of its tensor: none for a scalar, or numbers, of which kDimension is D.
+// Shape of an argument or result in a row of its tensor: empty for a scalar, or numbers, where kDimension means D.
 struct Entries {
   int rows = 0, columns = 0;
 };
@@ -39,14 +39,14 @@ struct PointwiseArguments {
   int function = 0;
   Column<const T> argument[kMostArguments];
   T number[kMostArguments] = {};   // where there is no column
-  Column<T> result[kMostResults];  // absent where not wanted
+  Column<T> result[kMostResults];  // absent where not requested
 };
 
 // Adjoints ḡ of the results give those of the arguments, ḡ · ∂f.
 template <class T, int D>
 struct PointwiseBackwardArguments : PointwiseArguments<T, D> {
   Column<const T> adjoint[kMostResults];
-  Column<T> gradient[kMostArguments];  // absent where not wanted
+  Column<T> gradient[kMostArguments];  // absent where not requested
 };
 
 // Derivatives of ḡ · ∂f v by the arguments and by ḡ.
@@ -58,7 +58,7 @@ struct PointwiseSecondArguments : PointwiseBackwardArguments<T, D> {
 
 inline namespace TORCH_MPM_ISA {
 
-// The arguments of a function one after another, and its results.
+// Arguments of a function one after another, and its results.
 template <class T, int D>
 struct Reader {
   const T* next;

@@ -2,7 +2,7 @@
 
 #include "pointwise/function.h"
 
-// The particles' part of a step of heat, and what a step does node by node (torch_mpm/heat).
+// Pointwise parts of a step of heat at particles and nodes (torch_mpm/heat).
 namespace mpm {
 inline namespace TORCH_MPM_ISA {
 
@@ -18,9 +18,9 @@ MPM_HD T safe_root(const T& squared) {
   return select(positive, sqrt(select(positive, squared, T(1))), T(0));
 }
 
-// Rest volume, J, F (either is the number one where the other tells the volume), C, κ, mass, dt, ∇v, dx to the present
+// Rest volume, J, F (either is the number one where the other gives the volume), C, κ, mass, dt, ∇v, dx to the present
 // volume V, heat capacity m C, conductance κ V, and the blend β = min(1, 4 r + dt |sym ∇v|) with the diffusion number
-// r. Where matter is strained, the gradient of the particle is forgotten for that of the grid.
+// r. Where matter is strained, the gradient of the particle relaxes to that of the grid.
 struct HeatWeights {
   static constexpr const char* name = "heat_weights";
   static constexpr Entries arguments[] = {kScalar, kScalar, kMatrix, kScalar, kScalar,
@@ -52,7 +52,7 @@ struct HeatWeights {
 };
 
 // θ, g, weight w and the share of a second weight in it: w θ of each weight, then the weights, for `scatter`; and their
-// moments w g, of which those of the weights alone are zero.
+// moments w g, of which those of the weights themselves are zero.
 template <int Weights>
 struct HeatMoments {
   static constexpr const char* name = Weights == 1 ? "heat_moments_1" : "heat_moments_2";
@@ -98,9 +98,9 @@ struct HeatMeans {
   }
 };
 
-// What particles gather, θ, g, β, ∇v and dt: θ and g after the step. Of two channels, the increments and θ̄, particles
-// take Σ N (d + β (θ̄ − θ)); of one, Σ N (d + β θ̄) − β θ, with the same β for all. Then g moves with matter that moves
-// by 1 + dt ∇v: the inverse transpose of that times g, to second order in dt.
+// Gathered values, θ, g, β, ∇v and dt: θ and g after the step. With two channels, the increments and θ̄, particles
+// receive Σ N (d + β (θ̄ − θ)); with one, Σ N (d + β θ̄) − β θ, with the same β for all. Then g is transported with
+// matter that moves by 1 + dt ∇v: the inverse transpose of that times g, to second order in dt.
 template <int Channels>
 struct HeatUpdate {
   static constexpr const char* name = Channels == 1 ? "heat_update_1" : "heat_update_2";
@@ -144,8 +144,8 @@ struct HeatUpdate {
   }
 };
 
-// θ, liquid fraction f, melting point θ_m, C, L: θ and f with the excess over the melting point in the latent heat, or
-// out of it (enthalpy buffer; Stomakhin et al. 2014).
+// θ, liquid fraction f, melting point θ_m, C, L: θ and f with the excess over the melting point moved into the latent
+// heat, or out of it (enthalpy buffer; Stomakhin et al. 2014).
 struct HeatMelt {
   static constexpr const char* name = "heat_melt";
   static constexpr Entries arguments[] = {kScalar, kScalar, kScalar, kScalar, kScalar};
@@ -176,9 +176,9 @@ struct HeatLayer {
   }
 };
 
-// Conductance κ V that is left so far, κ V itself, s'/a of a layer and D⁻¹: what it exchanges, κ V s'/a, and what is
-// left then. At the nodes a particle exchanges with Σ_i N_i (θ_i − T)², which on a linear temperature is D |∇θ|² more
-// than at the particle; this is taken from its κ V.
+// Remaining conductance κ V, κ V itself, s'/a of a layer and D⁻¹: its exchange, κ V s'/a, and the new remainder. At the
+// nodes a particle exchanges with Σ_i N_i (θ_i − T)², which for a linear temperature exceeds that at the particle by D
+// |∇θ|²; this is subtracted from its κ V.
 struct HeatExchange {
   static constexpr const char* name = "heat_exchange";
   static constexpr Entries arguments[] = {kScalar, kScalar, kScalar, kScalar};
@@ -238,7 +238,7 @@ struct Length {
 };
 
 // Position in the frame of a box around the origin, and its edge lengths: distance from its surface, negative inside,
-// NaN where a coordinate is. Its derivatives are not those of `Box.signed_distance` at ties and on the faces.
+// NaN where a coordinate is. Its derivatives differ from those of `Box.signed_distance` at ties and on the faces.
 struct BoxDistance {
   static constexpr const char* name = "box_distance";
   static constexpr Entries arguments[] = {kVector, kVector};

@@ -9,7 +9,7 @@
   PLAIN(pointwise_second, PointwiseSecondArguments)
 MPM_BACKEND_KERNELS(MPM_POINTWISE_KERNELS)
 
-// Functions of a row: each argument is a tensor, a row for each particle or node or one for all, or a number.
+// Functions of a row: each argument is a tensor, with a row for each particle or node or one for all, or a number.
 namespace mpm {
 namespace {
 
@@ -53,7 +53,7 @@ int rank_of(const Entries& e) { return e.rows == 0 ? 0 : e.columns == 0 ? 1 : 2;
 bool is_matrix(const Entries& e) { return e.rows == kDimension && e.columns == kDimension; }
 int size_of(const Entries& e, int dim) { return extent(e.rows, dim) * extent(e.columns, dim); }
 
-// Each place tells an argument or result, and no two the same.
+// Each place names an argument or result; places are distinct.
 void check_places(const char* name, const Places& places, size_t count) {
   std::vector<bool> taken(count, false);
   for (int64_t place : places) {
@@ -77,7 +77,7 @@ Shape shape_of_rows(const Entries& e, int64_t rows, int dim) {
   return shape;
 }
 
-// Whether a tensor stands for all rows: one without the dimension of rows, and a scalar [1].
+// Whether a tensor is shared by all rows: one without the dimension of rows, and a scalar [1].
 bool is_shared(const Tensor& t, const Entries& e, int64_t rows) {
   return t.dim() == rank_of(e) || (rank_of(e) == 0 && t.dim() == 1 && t.size(0) == 1 && rows != 1);
 }
@@ -94,7 +94,7 @@ void set_columns(Column<T>* columns, const Tensor& t, const Entries& e, int64_t 
   }
 }
 
-// A call as the ops take it, checked.
+// A call in the form of ops, checked.
 struct Call {
   const FunctionInfo& function;
   const int dim;
@@ -118,7 +118,7 @@ struct Call {
     for (size_t i = 0; i < tensors.size(); i++) check(tensors[i], "tensors", i, function.arguments, places[i], true);
   }
 
-  // Rows of the arguments: a scalar of one row may be one that all rows share.
+  // Rows of the arguments: a scalar of one row may be shared by all rows.
   void count_rows() {
     bool none = false;
     for (size_t i = 0; i < tensors.size(); i++) {
@@ -150,7 +150,7 @@ struct Call {
     a.count = rows;
     a.function = function.number;
     const std::vector<int> first = offsets(function.arguments, D);
-    for (size_t k = 0; k < numbers.size(); k++)  // of a matrix that many times the identity
+    for (size_t k = 0; k < numbers.size(); k++)  // for a matrix that multiple of the identity
       for (int n = first[k]; n < first[k + 1]; n++) {
         const bool zero = is_matrix(function.arguments[k]) && (n - first[k]) % (D + 1) != 0;
         a.number[n] = zero ? T(0) : T(numbers[k]);
