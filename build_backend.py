@@ -1,7 +1,7 @@
 """PEP 517 backend: setuptools, with torch as a build requirement only where the target environment has none.
 
-Building needs the headers and libtorch.so of some torch >= 2.11; which one does not matter, because the libraries use
-the LibTorch stable ABI. A fixed entry in [build-system] would make every isolated build unpack a second torch.
+Building needs the headers and libtorch.so of any torch >= 2.11, because the libraries use the LibTorch stable ABI. A
+fixed entry in [build-system] would make every isolated build unpack a second torch.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from setuptools.build_meta import *  # noqa: F403
 def torch_directory() -> Path | None:
     """Directory of the torch package, found without importing it.
 
-    Build isolation hides the packages of the environment that pip installs into, but its files can still be read.
+    Build isolation hides the packages of the target environment, but its files can still be read.
     """
     spec = importlib.util.find_spec("torch")
     visible = list(spec.submodule_search_locations or []) if spec else []

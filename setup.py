@@ -33,7 +33,7 @@ ROOT = Path(__file__).resolve().parent
 CSRC = ROOT / "csrc"
 DEVICE_FILES = Path("/dev")
 
-# The oldest torch whose stable ABI the libraries ask for: 2.11.
+# The oldest torch whose stable ABI the libraries require: 2.11.
 TORCH_TARGET_VERSION = "0x020b000000000000"
 
 # No option here gives up the value of an expression, unlike -ffast-math: errno and the floating-point exception flags
@@ -56,7 +56,7 @@ NVCC_FLAGS = [
     "-Xfatbin=-compress-all",
 ]
 
-# Definitions that tell the objects of one source apart.
+# Definitions that distinguish the objects of one source.
 VARIANTS = ("-DTORCH_MPM_ISA=", "-DMPM_SCALAR=", "-DMPM_DIMENSION=", "-DMPM_LAW_HEADER=")
 
 # Files csrc/*/*.cpu.cpp are compiled once per level, in the namespace named by TORCH_MPM_ISA.
@@ -64,9 +64,10 @@ X86_LEVELS = {"baseline": "x86-64", "avx2": "x86-64-v3", "avx512": "x86-64-v4"}
 
 
 def isa_levels(native: bool) -> dict[str, list[str]]:
-    """Compiler options of the instruction-set levels to build: all of this architecture, or this machine's best alone.
+    """Compiler options of the instruction-set levels to build: all of this architecture, or only the best of this
+    machine.
 
-    TORCH_MPM_ISA_LEVELS, "all" or "native", decides where it is set.
+    TORCH_MPM_ISA_LEVELS, "all" or "native", overrides the default.
     """
     choice = os.environ.get("TORCH_MPM_ISA_LEVELS") or ("native" if native else "all")
     if choice not in ("all", "native"):
@@ -92,7 +93,7 @@ def best_level() -> str:
 def cuda_wanted(native: bool) -> bool:
     """Whether to build the CUDA library: where nvcc is found and, if for this machine only, it has a GPU.
 
-    TORCH_MPM_CUDA, 1 or 0, decides where it is set.
+    TORCH_MPM_CUDA, 1 or 0, overrides this.
     """
     choice = os.environ.get("TORCH_MPM_CUDA", "")
     if choice not in ("", "0", "1"):
@@ -170,8 +171,8 @@ class Ninja:
         # The C++ library of the process, by its file name, since the compiler may come with a static one only: errors
         # thrown here are caught in torch.
         libtorch += ["-Xlinker", "-l:libstdc++.so.6"]
-        # Functions that nobody defines fail the link. Not in the CUDA library, since a CPU torch has no CUDA functions,
-        # nor with sanitizers, whose functions come from the process.
+        # Undefined functions fail the link. Not in the CUDA library, since a CPU torch has no CUDA functions, nor with
+        # sanitizers, whose functions come from the process.
         defined = [] if sanitize else ["-Xlinker", "--no-undefined", "-ltorch_cpu"]
         compilers = max(1, max_jobs() // min(NVCC_THREADS, len(cuda_archs())))
         self.lines = ["ninja_required_version = 1.5", f"pool nvcc\n  depth = {compilers}"]
@@ -257,7 +258,7 @@ def parts(sources: Iterable[Path]) -> list[tuple[Path, list[str]]]:
 
 
 def math_library(version: str) -> Library | None:
-    """The pybind11 module torch_mpm._math. It serves one Python version only and is meant for tests."""
+    """The pybind11 module torch_mpm._math. It supports one Python version only and is meant for tests."""
     pybind11 = importlib.util.find_spec("pybind11")
     python = Path(sysconfig.get_path("include"))
     if pybind11 is None or not pybind11.origin or not (python / "Python.h").exists():
@@ -302,7 +303,7 @@ class Build(build_ext):
             return
         destination = ROOT if self.inplace or self.editable_mode else Path(self.build_lib)
         sanitize = os.environ.get("TORCH_MPM_SANITIZE", "")
-        # What is built in place serves this machine; a wheel serves every one.
+        # A build in place is for this machine; a wheel is for all machines.
         self.native = bool(self.inplace or self.editable_mode)
         self.levels = isa_levels(self.native)
         # One place for in-place, editable and wheel builds, so that each reuses the objects of the others.
@@ -328,7 +329,7 @@ class Build(build_ext):
         self.describe(destination / "torch_mpm/lib/build.json", list(libraries), torch_version(torch), sanitize)
 
     def libraries_to_build(self) -> dict[str, Library]:
-        """Every target asked for that this machine can build."""
+        """Requested targets that this machine can build."""
         wanted = self.targets.split(",") if self.targets else ["cpu", "cuda", "math"]
         if unknown := set(wanted) - {"cpu", "cuda", "math"}:
             raise SystemExit(f"--targets must be of cpu, cuda, math, got {sorted(unknown)}")
@@ -342,7 +343,7 @@ class Build(build_ext):
         return libraries
 
     def describe(self, path: Path, built: list[str], torch: str, sanitize: str) -> None:
-        """Write what `python -m torch_mpm info` shows; targets not built this time keep their entry."""
+        """Write the data of `python -m torch_mpm info`; targets that are not built now keep their entry."""
         record = json.loads(path.read_text()) if path.exists() else {}
         record |= {"version": self.distribution.get_version(), "torch_headers": torch}
         record["torch_target"] = "2.11"

@@ -1,6 +1,6 @@
-"""Find the stiffness of a soft beam from how far it sags under its weight: gradients of a static equilibrium.
+"""Find the stiffness of a soft beam from its sag under its weight: gradients of a static equilibrium.
 
-A cantilever is measured at its tip, here in a simulation whose Young's modulus the search does not know. One implicit
+A cantilever is measured at its tip, here in a simulation with a Young's modulus unknown to the search. One implicit
 step without inertia is the equilibrium, and its gradient costs one more linear solve.
 """
 
@@ -15,7 +15,7 @@ LENGTH, HEIGHT, DX = 1.0, 0.1, 0.025  # [m]
 
 
 def sag(E: torch.Tensor) -> torch.Tensor:
-    """How far the tip of the beam comes down [m]."""
+    """Displacement of the tip of the beam downwards [m]."""
     grid = mpm.Grid(dx=DX, lower=(-0.2, -0.8), upper=(1.1, 0.4))
     points = mpm.seed.box((-2 * DX, -HEIGHT / 2), (LENGTH, HEIGHT / 2), grid, per_cell=4)
     beam = mpm.State.at_rest(points, density=1000.0, dtype=torch.float64)
@@ -29,7 +29,7 @@ def sag(E: torch.Tensor) -> torch.Tensor:
 
 
 def main(iterations: int = 8) -> float:
-    """Returns the relative error of the stiffness found."""
+    """Returns the relative error of the identified stiffness."""
     truth = 3e6
     measured = sag(torch.tensor(truth, dtype=torch.float64))
     log_E = torch.tensor(2e7, dtype=torch.float64).log().requires_grad_()

@@ -1,9 +1,9 @@
-"""Find the stiffness of a jelly cube, and how it was thrown, from noisy pictures of one camera.
+"""Find the stiffness of a jelly cube, and the velocity of its throw, from noisy pictures of one camera.
 
-The particles are splatted on the picture: each is a Gaussian spot of its size, and spots add up to opacity. That is
+The particles are splatted on the picture: each is a Gaussian spot of its size, and spots add up to opacity. This is
 plain torch and differentiable, so that the gradient of the difference between pictures passes through the camera and
-through the simulation, to Young's modulus, Poisson's ratio and the three components of the initial velocity. What moves
-the cube away from the camera shows in its size alone.
+through the simulation, to Young's modulus, Poisson's ratio and the three components of the initial velocity. Motion of
+the cube away from the camera shows only in its size.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from torch import Tensor, nn
 import torch_mpm as mpm
 
 DX, DT = 1 / 16, 2e-3  # [m], [s]
-STEPS, EVERY = 240, 20  # of which a picture is taken every so many
+STEPS, EVERY = 240, 20  # steps between two pictures
 HEIGHT, WIDTH = 64, 96  # of the pictures [pixels]
 NOISE = 0.05  # deviation of the noise of each pixel, between 0 and 1
 TRUE = {"E": 3e4, "nu": 0.35, "vx": 2.0, "vy": -0.5, "vz": 0.6}  # [Pa], –, [m/s]
@@ -61,7 +61,7 @@ def splat(x: Tensor) -> Tensor:
 def difference(a: Tensor, b: Tensor) -> Tensor:
     """Mean square of the difference of pictures, added up over five resolutions.
 
-    In coarse pictures, things feel each other from afar.
+    In coarse pictures, distant spots overlap.
     """
     total = (a - b).square().mean()
     for _ in range(4):
@@ -74,7 +74,7 @@ def difference(a: Tensor, b: Tensor) -> Tensor:
 
 
 def pictures(start: mpm.State, E: Tensor, nu: Tensor, *velocity: Tensor) -> Tensor:
-    """What the camera sees [STEPS / EVERY + 1, HEIGHT, WIDTH] of a cube that is thrown on the floor."""
+    """Pictures [STEPS / EVERY + 1, HEIGHT, WIDTH] of a cube that is thrown on the floor."""
     grid = mpm.Grid(DX, lower=(0, 0, 0), upper=(1.6, 1, 1))
     step = mpm.Step(grid, mpm.NeoHookean(E=E, nu=nu), (0, -9.8, 0), mpm.Walls("separate", friction=0.3))
     thrown = start.replace(v=start.v + torch.stack(velocity))
@@ -82,7 +82,7 @@ def pictures(start: mpm.State, E: Tensor, nu: Tensor, *velocity: Tensor) -> Tens
 
 
 def fit(start: mpm.State, data: Tensor, iterations: int) -> list[dict[str, float]]:
-    """The unknowns after each iteration, from the guess on."""
+    """Unknowns after each iteration, including the guess."""
     guess, bounds = (start.x.new_tensor(list(values.values())) for values in (GUESS, BOUNDS))
     change = torch.zeros_like(guess).requires_grad_()  # of the logits of E and nu, and of the velocity
     optimizer = torch.optim.LBFGS([change], max_iter=1, max_eval=10, line_search_fn="strong_wolfe")
@@ -145,7 +145,7 @@ if __name__ == "__main__":
     parser.add_argument("--out", type=Path, default=Path("out/fit_images"), help="folder of the picture")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--iterations", type=int, default=25)
-    torch.set_num_threads(1)  # a thousand particles: more threads would only wait for each other
+    torch.set_num_threads(1)  # A thousand particles: more threads would only wait for each other.
     options, begin = parser.parse_args(), time.perf_counter()
     found = main(options.out, options.device, options.iterations)
     print("relative errors: " + ", ".join(f"{name} {error:.2%}" for name, error in found.items()))

@@ -1,7 +1,7 @@
 """A small network acts on the grid: trained to blow a falling drop of jelly sideways onto a target.
 
-The network sees position and velocity of each grid node and adds an acceleration to it; it is called inside the step,
-and its weights get their gradient through the simulation.
+The inputs of the network are position and velocity of each grid node, its output is an additional acceleration. It is
+called inside the step, and its weights get their gradient through the simulation.
 """
 
 import argparse
@@ -13,7 +13,7 @@ import torch_mpm as mpm
 
 
 class Wind(nn.Module):
-    """Acceleration of the nodes [m/s^2] from where they are and how they move."""
+    """Acceleration of the nodes [m/s^2] from their positions and velocities."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Find the conductivity of a plate everywhere, from how the temperature changes in four experiments.
+"""Find the conductivity field of a plate from the change of its temperature in four experiments.
 
 Each experiment starts from another temperature and is a scene of one batch; the conductivity is unknown on a coarse
 mesh and bilinear between. The gradient of the misfit goes through every implicit step of the conduction.

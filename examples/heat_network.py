@@ -1,4 +1,4 @@
-"""A network is the conductivity law: it learns how the conductivity depends on temperature from one heated bar.
+"""A network as the conductivity law: it learns the dependence of the conductivity on temperature from one heated bar.
 
 The network is called inside every step with the temperatures of the particles, and its weights get their gradient
 through the implicit solves.
@@ -27,7 +27,7 @@ class Conductivity(nn.Module):
 
 
 def true_law(theta: Tensor) -> Tensor:
-    """A conductivity that falls by half where the material changes phase, at 0.5."""
+    """A conductivity that drops by half where the material changes phase, at 0.5."""
     return 1 - 0.5 * torch.sigmoid(12 * (theta - 0.5)) + 0.3 * theta
 
 

@@ -1,6 +1,6 @@
-"""A network learns how the friction of a floor depends on the speed, from how four blocks slide to a stop.
+"""A network learns the dependence of the friction of a floor on the speed from four blocks that slide to a stop.
 
-The network acts on the grid: in every step it is asked for the coefficient at each node that the floor stops, and its
+The network acts on the grid: in every step it returns the coefficient at each node that the floor stops, and its
 weights get their gradient through the simulation. The true law is that of lubricated contact, high near sticking and
 low at speed (Stribeck). Only positions of particles are measured, with errors.
 """
@@ -18,8 +18,8 @@ from torch import Tensor, nn
 import torch_mpm as mpm
 
 DX, DT = 1 / 20, 2e-3  # [m], [s]
-EVERY = 20  # steps from one measurement to the next
-SPEEDS = (0.2, 0.6, 1.4, 2.8)  # of the blocks at first [m/s]
+EVERY = 20  # steps between two measurements
+SPEEDS = (0.2, 0.6, 1.4, 2.8)  # initial speed of the blocks [m/s]
 NOISE = 1e-4  # deviation of the measured positions [m]
 Law = Callable[[Tensor], Tensor]
 
@@ -42,7 +42,7 @@ class Friction(nn.Module):
 
 
 class Floor(nn.Module):
-    """Coulomb's friction on nodes at y ≤ 0: they lose their velocity into the floor, and μ times as much along it."""
+    """Coulomb friction on nodes at y ≤ 0: they lose their velocity into the floor, and μ times as much along it."""
 
     def __init__(self, law: Law) -> None:
         super().__init__()
@@ -64,16 +64,16 @@ def sliding_blocks(device: str) -> mpm.State:
 
 
 class Experiment(nn.Module):
-    """What is measured when blocks slide by a law of friction: positions [P, steps / EVERY + 1, 2] [m]."""
+    """Measurements of blocks that slide by a law of friction: positions [P, steps / EVERY + 1, 2] [m]."""
 
     def __init__(self, law: Law, steps: int) -> None:
         super().__init__()
-        grid = mpm.Grid(DX, lower=(0, 0), upper=(3, 0.5), scenes=len(SPEEDS), max_blocks=85 * len(SPEEDS))  # all
+        grid = mpm.Grid(DX, lower=(0, 0), upper=(3, 0.5), scenes=len(SPEEDS), max_blocks=85 * len(SPEEDS))  # all blocks
         self.step = mpm.Step(grid, mpm.NeoHookean(E=1e5, nu=0.3), gravity=(0, -9.8), on_grid=Floor(law))
         self.steps = steps
 
     def forward(self, start: mpm.State, dt: float = DT) -> mpm.State:
-        """The state at the end, with the measurements in `extra`."""
+        """State at the end, with the measurements in `extra`."""
         frames = mpm.frames(self.step, start, self.steps, dt, EVERY, fields=["x"])
         return frames.end.replace(extra={"measured": frames.fields["x"].movedim(0, 1)})
 
@@ -84,7 +84,7 @@ def measured(simulated: Callable[[mpm.State], mpm.State], start: mpm.State) -> T
 
 
 def draw(x: Tensor, speeds: Tensor, laws: dict[str, Tensor], path: Path) -> None:
-    """How far the blocks slide, and the laws."""
+    """Plot of the sliding distances of the blocks, and the laws."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 3.3), dpi=100)
@@ -139,7 +139,7 @@ if __name__ == "__main__":
     parser.add_argument("--out", type=Path, default=Path("out/learn_friction"), help="folder of the picture")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--iterations", type=int, default=30)
-    torch.set_num_threads(1)  # some hundred particles: more threads would only wait for each other
+    torch.set_num_threads(1)  # A few hundred particles: more threads would only wait for each other.
     options, begin = parser.parse_args(), time.perf_counter()
     error = main(options.out, options.device, options.iterations)
     print(f"error of the law {error:.2%}")

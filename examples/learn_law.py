@@ -1,4 +1,4 @@
-"""A network learns the law of an unknown material from how blocks of it moved, and simulates another shape with it.
+"""A network learns the law of an unknown material from the motion of blocks, and simulates another shape with it.
 
 The material is a tissue that stiffens as it is deformed. Four blocks of it are thrown on the floor and against walls,
 and only the positions of their particles are measured: no stress, no strain. The network gives an elastic energy; it is
@@ -19,7 +19,7 @@ from torch import Tensor, nn
 import torch_mpm as mpm
 
 DX, DT = 1 / 20, 1.5e-3  # [m], [s]
-EVERY = 15  # steps from one measurement to the next
+EVERY = 15  # steps between two measurements
 SIZE = 0.5  # diameter of the ring [m]
 SCALE = 1e4  # [Pa], of the moduli before training
 Law = Callable[[Tensor], Tensor]
@@ -32,7 +32,7 @@ class Energy(nn.Module):
     """An isotropic law F [P, 2, 2] -> Kirchhoff stress [P, 2, 2] [Pa], by its energy ψ = m(s, a) s + k(s, a) a²/2.
 
     s = tr(F Fᵀ)/J − 2 measures shear and a = ln J the change of area; there is no stress at rest, and both moduli are
-    positive, whatever the weights.
+    positive for any weights.
     """
 
     def __init__(self) -> None:
@@ -66,7 +66,7 @@ def stress_of(energy: Callable[[Tensor, Tensor], Tensor], F: Tensor) -> Tensor:
 
 
 def thrown_blocks(device: str) -> mpm.State:
-    """Four scenes: width and height, place [m] and velocity [m/s] of a block each."""
+    """Four scenes: width and height, position [m] and velocity [m/s] of a block each."""
     scenes = []
     for (width, height), (x, y), velocity in (
         ((0.3, 0.3), (0.5, 0.2), (0.0, -3.0)),
@@ -89,16 +89,16 @@ def thrown_ring(device: str) -> mpm.State:
 
 
 class Experiment(nn.Module):
-    """What is measured when scenes are simulated with a law: positions [P, steps / EVERY + 1, 2] [m]."""
+    """Measurements of scenes simulated with a law: positions [P, steps / EVERY + 1, 2] [m]."""
 
     def __init__(self, law: Law, scenes: int, steps: int) -> None:
         super().__init__()
-        grid = mpm.Grid(DX, lower=(0, 0), upper=(1.5, 1), scenes=scenes, max_blocks=70 * scenes)  # all
+        grid = mpm.Grid(DX, lower=(0, 0), upper=(1.5, 1), scenes=scenes, max_blocks=70 * scenes)  # all scenes
         self.step = mpm.Step(grid, law, gravity=(0, -9.8), walls="sticky")
         self.steps = steps
 
     def forward(self, start: mpm.State, dt: float = DT) -> mpm.State:
-        """The state at the end, with the measurements in `extra`."""
+        """State at the end, with the measurements in `extra`."""
         frames = mpm.frames(self.step, start, self.steps, dt, EVERY, fields=["x"])
         return frames.end.replace(extra={"measured": frames.fields["x"].movedim(0, 1)})
 
@@ -190,7 +190,7 @@ if __name__ == "__main__":
     parser.add_argument("--out", type=Path, default=Path("out/learn_law"), help="folder of the picture")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--iterations", type=int, default=60)
-    torch.set_num_threads(1)  # some hundred particles: more threads would only wait for each other
+    torch.set_num_threads(1)  # A few hundred particles: more threads would only wait for each other.
     options, begin = parser.parse_args(), time.perf_counter()
     error = main(options.out, options.device, options.iterations)
     print(f"positions of the ring are off by at most {error:.2%} of its diameter, in the mean of its particles")

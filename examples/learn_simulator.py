@@ -1,11 +1,11 @@
-"""A graph network learns to simulate sand, from a data set on disk or from scenes that are simulated meanwhile.
+"""A graph network learns to simulate sand, from a data set on disk or from scenes that are simulated during training.
 
     python examples/learn_simulator.py             # generates a small data set, trains for some minutes on two cores
     python examples/learn_simulator.py --online    # trains on other scenes, without a data set of them
 
-The network sees the last five velocities of each particle and where its neighbours and the walls are, and predicts the
-acceleration (Sanchez-Gonzalez et al. 2020, smaller). It is rolled out beside the truth on scenes that it has not seen,
-and beside the baseline that each particle keeps its velocity.
+The inputs of the network are the last five velocities of each particle and the positions of its neighbours and the
+walls; its output is the acceleration (Sanchez-Gonzalez et al. 2020, smaller). Its rollouts are compared with the truth
+on unseen scenes, and with the baseline that each particle keeps its velocity.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ WIDTH, LAYERS = 48, 4
 
 @dataclass
 class Domain:
-    """What scales the inputs: bounds [D] and radius of neighbours [m], moments of velocities and accelerations [D]."""
+    """Scales of the inputs: bounds [D] and radius of neighbours [m], moments of velocities and accelerations [D]."""
 
     lower: Tensor
     upper: Tensor
@@ -64,7 +64,7 @@ def perceptron(inputs: int, outputs: int, norm: bool = True) -> nn.Sequential:
 
 
 class Simulator(nn.Module):
-    """From the positions of a few frames to the next positions."""
+    """Network from the positions of a few frames to the next positions."""
 
     def __init__(self, domain: Domain) -> None:
         super().__init__()
@@ -97,14 +97,14 @@ class Simulator(nn.Module):
         steps = torch.randn_like(window[:, 1:-1]) * noise * domain.velocity / (HISTORY - 1) ** 0.5
         moved = torch.cat([torch.zeros_like(window[:, :1]), steps.cumsum(1).cumsum(1)], 1)
         history = window[:, :-1] + moved
-        following = window[:, -1] + moved[:, -1]  # the noise in the last velocity is to be corrected
+        following = window[:, -1] + moved[:, -1]  # The noise in the last velocity is to be corrected.
         acceleration = following - 2 * history[:, -1] + history[:, -2]
         wanted = (acceleration - domain.acceleration_mean) / domain.acceleration
         return nn.functional.smooth_l1_loss(self(history, scene), wanted, beta=1.0)
 
     @torch.no_grad()
     def rollout(self, first: Tensor, frames: int) -> Tensor:
-        """Positions [N, frames, D] that follow the first HISTORY of them, which are given."""
+        """Positions [N, frames, D] after the first HISTORY given ones."""
         positions, scene = list(first.unbind(1)), torch.zeros(len(first), dtype=torch.long, device=first.device)
         for _ in range(frames - HISTORY):
             normalised = self(torch.stack(positions[-HISTORY:], 1), scene)
@@ -115,7 +115,7 @@ class Simulator(nn.Module):
 
 
 def neighbours(x: Tensor, scene: Tensor, radius: float) -> tuple[Tensor, Tensor]:
-    """Pairs of particles of one scene that are nearer than the radius."""
+    """Pairs of particles of one scene within the radius."""
     near = (torch.cdist(x, x, compute_mode="donot_use_mm_for_euclid_dist") < radius) & (scene[:, None] == scene)
     near.fill_diagonal_(False)
     sender, receiver = near.nonzero(as_tuple=True)
@@ -154,7 +154,7 @@ def constant_velocity(first: Tensor, frames: int, domain: Domain) -> Tensor:
 
 
 def errors(predicted: Tensor, truth: Tensor) -> Tensor:
-    """Mean distance [frames] (m) of particles [N, frames, D] from where they should be."""
+    """Mean distance [frames] (m) of particles [N, frames, D] from their true positions."""
     return (predicted - truth).norm(dim=2).mean(0)
 
 
@@ -236,7 +236,7 @@ def main() -> None:
     options = parser.parse_args()
     torch.manual_seed(0)
     config, folder = configuration(options.scenes), options.out / "data"
-    generate(config, folder, device=options.device)  # what is missing of it
+    generate(config, folder, device=options.device)  # Missing shards only.
     data = DatasetFolder(folder)
     domain = Domain.of(data, data.motion("train"), torch.device(options.device))
     model = Simulator(domain).to(options.device)

@@ -1,8 +1,8 @@
-"""Find Young's modulus, Poisson's ratio and a friction angle from how things moved.
+"""Find Young's modulus, Poisson's ratio and a friction angle from measured motions.
 
-A jelly cube is thrown on the floor, and a column of sand collapses. Of both, the positions of the particles are known
-at some times, with errors of measurement. The parameters start far off and follow the gradient of the misfit through
-the whole simulation.
+A jelly cube is thrown on the floor, and a column of sand collapses. For both, the positions of the particles are known
+at some times, with measurement errors. The parameters start far off and follow the gradient of the misfit through the
+whole simulation.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ NOISE = 1e-3  # deviation of the measured positions [m]: a thirtieth of a cell
 
 @dataclass
 class Experiment:
-    """Something that moves, and the parameters of its law by name: true ones, guesses, and bounds above (0 below)."""
+    """A moving body, and the parameters of its law by name: true ones, guesses, and bounds above (0 below)."""
 
     name: str
     start: mpm.State
@@ -39,7 +39,7 @@ class Experiment:
     found: list[dict[str, float]] = field(init=False)
 
     def observed(self, values: Sequence[float | Tensor]) -> Tensor:
-        """Positions [13, P, 2] [m] of the particles in the course of time, for some values of the parameters."""
+        """Positions [13, P, 2] [m] of the particles over time, for some values of the parameters."""
         law = self.law(**dict(zip(self.true, values, strict=True)))
         step = mpm.Step(GRID, law, gravity=(0, -9.8), walls=mpm.Walls("separate", friction=0.5))
         every = round(self.seconds / DT / 12)
@@ -93,7 +93,7 @@ def sand(device: str) -> Experiment:
 
 
 def draw(experiments: Sequence[Experiment], path: Path) -> None:
-    """Where the particles were measured at the end and where they are simulated, and the errors of the parameters."""
+    """Plot of the measured and the simulated final positions, and the errors of the parameters."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 3.5), dpi=100)
@@ -135,7 +135,7 @@ if __name__ == "__main__":
     parser.add_argument("--out", type=Path, default=Path("out/recover_parameters"), help="folder of the picture")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--iterations", type=int, default=14)
-    torch.set_num_threads(1)  # some hundred particles: more threads would only wait for each other
+    torch.set_num_threads(1)  # A few hundred particles: more threads would only wait for each other.
     options, begin = parser.parse_args(), time.perf_counter()
     found = main(options.out, options.device, options.iterations)
     print("relative errors: " + ", ".join(f"{name} {error:.2%}" for name, error in found.items()))

@@ -1,4 +1,4 @@
-"""Find the stiffness of every particle of a plate from how it moved in four experiments.
+"""Find the stiffness of every particle of a plate from its motion in four experiments.
 
 The plate is stiffer in one disc and softer in another. It is set in motion four times, each time with other
 velocities, as the four scenes of one batch, and the positions of its particles are measured at some times. The
@@ -18,7 +18,7 @@ from torch import Tensor
 
 import torch_mpm as mpm
 
-DT, STEPS, EVERY = 2e-3, 60, 10  # time step [s], of which the positions are measured every so many
+DT, STEPS, EVERY = 2e-3, 60, 10  # time step [s]; steps between two measurements
 NOISE = 1e-4  # deviation of the measured positions [m]
 GUESS = 1.5e4  # Young's modulus before the first iteration [Pa]
 
@@ -80,7 +80,7 @@ def main(out: Path, device: str = "cpu", cells: int = 24, iterations: int = 50) 
     with torch.no_grad():
         data = observed(true)
     data = data + NOISE * torch.randn_like(data)
-    # What no experiment strains, as the corners, follows the level of all.
+    # Regions that no experiment strains, such as the corners, get the mean level.
     level, deviation = start.x.new_zeros(1, requires_grad=True), start.x.new_zeros(len(rest), requires_grad=True)
     optimizer = torch.optim.LBFGS([level, deviation], max_iter=1, max_eval=10, line_search_fn="strong_wolfe")
 
@@ -99,7 +99,7 @@ def main(out: Path, device: str = "cpu", cells: int = 24, iterations: int = 50) 
         with torch.no_grad():
             error = float((found() - true).norm() / true.norm())
         print(f"{k:3d}  misfit {misfit:9.3f}  error of the stiffness {error:.2%}", flush=True)
-        if misfit < 1.005:  # the rest is noise
+        if misfit < 1.005:  # The rest is noise.
             break
     out.mkdir(parents=True, exist_ok=True)
     draw(rest, true, found().detach(), out / "recover_stiffness_field.png")
@@ -111,7 +111,7 @@ if __name__ == "__main__":
     parser.add_argument("--out", type=Path, default=Path("out/recover_stiffness_field"), help="folder of the picture")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--iterations", type=int, default=50)
-    torch.set_num_threads(1)  # some hundred particles: more threads would only wait for each other
+    torch.set_num_threads(1)  # A few hundred particles: more threads would only wait for each other.
     options, begin = parser.parse_args(), time.perf_counter()
     error = main(options.out, options.device, iterations=options.iterations)
     print(f"error of the stiffness {error:.2%}")

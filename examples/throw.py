@@ -13,11 +13,11 @@ import torch_mpm as mpm
 
 GRID = mpm.Grid(dx=0.04, lower=(0, 0), upper=(1, 1))
 TARGET = (0.8, 0.2)  # of the centre of mass [m]
-STEPS, EVERY, DT = 200, 10, 1.5e-3  # a throw, frames of it, and the time step [s]
+STEPS, EVERY, DT = 200, 10, 1.5e-3  # steps of a throw, frames of it, and the time step [s]
 
 
 def draw(paths: list[Tensor], misses: list[float], before: Tensor, after: Tensor, path: Path) -> None:
-    """The ways of the ball's centre, the ball at the end of the first and the best throw, and the misses."""
+    """Paths of the ball's centre, the ball at the end of the first and the best throw, and the misses."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 4), dpi=100)
@@ -65,7 +65,7 @@ if __name__ == "__main__":
     parser.add_argument("--out", type=Path, default=Path("out/throw"), help="folder of the picture")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--iterations", type=int, default=8)
-    torch.set_num_threads(1)  # some hundred particles: more threads would only wait for each other
+    torch.set_num_threads(1)  # A few hundred particles: more threads would only wait for each other.
     options, begin = parser.parse_args(), time.perf_counter()
     best = main(options.out, options.device, options.iterations)
     print(f"best miss {best:.4f} m")

@@ -1,9 +1,9 @@
 """A soft walker learns to walk: the controller of its muscles is trained through the simulation.
 
-The walker is a torso on two legs, each of two muscles side by side. A small network sees a clock, how the walker stands
-and how it moves, and sets the length of each muscle 50 times a second. A muscle changes the shape in which it is free
-of stress (active strain, Nardinocchi and Teresi 2007): with F = F_elastic diag(1/λ, λ) it tends to λ times its length.
-The reward is how fast the walker goes, upright, in the first one or two seconds. Then it walks on for twice as long.
+The walker is a torso on two legs, each of two muscles side by side. The inputs of a small network are a clock and the
+pose and motion of the walker; it sets the length of each muscle 50 times a second. A muscle changes its stress-free
+shape (active strain, Nardinocchi and Teresi 2007): with F = F_elastic diag(1/λ, λ) it tends to λ times its length. The
+reward is the speed of the upright walker in the first one or two seconds. Then it walks for twice as long.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from torch_mpm import render
 
 LOWER, UPPER = (0.0, 0.0), (4.4, 0.5)  # of the domain [m]
 GRID = mpm.Grid(dx=1 / 40, lower=LOWER, upper=UPPER)
-DT, EVERY = 1e-3, 20  # time step [s]; steps from one control to the next
+DT, EVERY = 1e-3, 20  # time step [s]; steps between two controls
 STRETCH = 0.2  # muscles change their length by up to this share
 FREQUENCY = 3.0  # of the clock [Hz]
 MUSCLES = 4
@@ -94,7 +94,7 @@ def train(controller: Controller, start: mpm.State, iterations: int, seconds: fl
 
 
 def draw(walked: mpm.Frames, speeds: list[float], part: Tensor, path: Path) -> None:
-    """Where the walker is every 0.8 s, how its speed grew in training, and the lengths of the muscles."""
+    """Plot of the walker every 0.8 s, its speed in training, and the lengths of the muscles."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10, 4.6), dpi=100)
@@ -132,7 +132,7 @@ def film(walked: mpm.Frames, path: Path) -> None:
 
 
 def main(out: Path, device: str = "cpu", iterations: int = 100, seconds: float = 1.0, shown: float = 4.0) -> float:
-    """Returns how far the walker comes [m] in the seconds that are shown, twice as many as it was trained for."""
+    """Returns the distance of the walk [m] in the displayed seconds, twice as many as in training."""
     torch.manual_seed(0)
     start = walker(device)
     controller = Controller(start).to(device)
@@ -150,7 +150,7 @@ if __name__ == "__main__":
     parser.add_argument("--out", type=Path, default=Path("out/walker"), help="folder of the picture and the video")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--iterations", type=int, default=100)
-    torch.set_num_threads(1)  # some hundred particles: more threads would only wait for each other
+    torch.set_num_threads(1)  # A few hundred particles: more threads would only wait for each other.
     options, begin = parser.parse_args(), time.perf_counter()
     way = main(options.out, options.device, options.iterations)
     print(f"the walker, 0.3 m long, comes {way:.2f} m far in 4 s")

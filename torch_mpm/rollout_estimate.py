@@ -97,7 +97,7 @@ def _estimate(
     dt: float | Tensor,
     plan: RolloutPlan,
 ) -> RolloutEstimate:
-    """Of n steps with gradients, as planned, after `prefix` steps without."""
+    """Estimate of n steps with gradients, as planned, after `prefix` steps without."""
     in_op, keeps_all = plan.executor == "fused", plan.stores_all
     kept = None if keeps_all else plan.checkpoints
     of_state, of_step = bytes_kept(step, start, dt, in_op)

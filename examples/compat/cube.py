@@ -1,4 +1,4 @@
-"""A cube of jelly or sand falls on a floor: a script for MPM-PyTorch, of which the import has changed."""
+"""A cube of jelly or sand falls on a floor: a script for MPM-PyTorch with a changed import."""
 
 import argparse
 

@@ -1,4 +1,4 @@
-"""A column of Gaussians bends under a push: a script for PhysGaussian's simulator, of which the import has changed."""
+"""A column of Gaussians bends under a push: a script for PhysGaussian's simulator with a changed import."""
 
 import argparse
 from pathlib import Path

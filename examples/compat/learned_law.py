@@ -1,7 +1,7 @@
-"""Train the networks of NCLaw as elasticity and plasticity, on what a von Mises solid did: their imports have changed.
+"""Train the networks of NCLaw as elasticity and plasticity on the motion of a von Mises solid, with changed imports.
 
-The networks are those of the paper, R sym M(σ, FᵀF, det F) Fᵀ and F + α R sym M(...), called between steps. As there,
-loss and gradients begin anew from the data every few steps.
+The networks are those of the paper, R sym M(σ, FᵀF, det F) Fᵀ and F + α R sym M(...), called between steps. As in
+NCLaw, loss and gradients restart from the data every few steps.
 """
 
 import argparse
@@ -24,7 +24,7 @@ BODY = SimpleNamespace(shape=CUBE, rho=1e3, clip_bound=0.5, span=[0, 1000])
 NETWORK = SimpleNamespace(
     layer_widths=[64, 64], no_bias=True, norm=None, nonlinearity="gelu", normalize_input=True, alpha=1e-3
 )
-SEGMENT = 10  # steps between two looks at the data
+SEGMENT = 10  # steps between two data points
 
 
 def main(epochs: int = 20, steps: int = 40) -> tuple[float, float]:
@@ -53,7 +53,7 @@ def main(epochs: int = 20, steps: int = 40) -> tuple[float, float]:
 
     elasticity = material.InvariantFullMetaElasticity(NETWORK)
     plasticity = material.InvariantFullMetaPlasticity(NETWORK)
-    scale = 1e5  # [Pa], of what the network returns
+    scale = 1e5  # [Pa], scale of the network's output
     optimizer = torch.optim.Adam([*elasticity.parameters(), *plasticity.parameters()], lr=1e-2)
     errors = []
     for epoch in range(epochs):

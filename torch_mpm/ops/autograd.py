@@ -67,7 +67,7 @@ def register_autograd(
     """
     op = getattr(torch.ops.torch_mpm, name).default
     lists = [i for i, a in enumerate(op._schema.arguments) if str(a.type) == "List[Tensor]" and a.name != "topology"]
-    defaults = tuple(a.default_value for a in op._schema.arguments)  # of last arguments, which torch leaves out
+    defaults = tuple(a.default_value for a in op._schema.arguments)  # of trailing arguments, which torch omits
 
     def forward(ctx: Any, lengths: list[int], *flat: Any) -> Any:
         arguments = _nested(flat, lists, lengths)

@@ -1,1 +1,1 @@
-"""Every op again in plain torch: the specification that the tests compare with, differentiable to any order."""
+"""All ops in plain torch: the specification for tests, differentiable to any order."""

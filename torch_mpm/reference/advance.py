@@ -1,4 +1,4 @@
-"""The end of a step in plain torch: x ← x + dt v, F ← (I + dt C) F, J ← J (1 + dt tr C)."""
+"""End of a step in plain torch: x ← x + dt v, F ← (I + dt C) F, J ← J (1 + dt tr C)."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def g2p_advance(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor | None]:
     """x, v, C, F and J; `dt` is a number or one value per particle. See `torch_mpm.ops.g2p_advance`."""
     v, C, grad_v = transfer.g2p(blocks, x, velocity)
-    lost = ~x.isfinite().all(1)  # which stay as they are
+    lost = ~x.isfinite().all(1)  # Particles that are unchanged.
     moved, L = v.masked_fill(lost[:, None], 0), C if stress_form == "mls" else grad_v
     next_x, F, J = advance(x, moved, dt, L.masked_fill(lost[:, None, None], 0), F, J)
     return next_x, v, C, F, J

@@ -11,7 +11,7 @@ from ..grid import Grid
 from ..state import State
 
 LARGEST_CHANGE = 0.5
-"""Of a stretch or of the volume of a particle in one step."""
+"""Maximum relative change of a stretch or of the volume of a particle in one step."""
 
 
 def survey(
@@ -26,7 +26,7 @@ def survey(
     energy: Tensor | None = None,
     speed: Tensor | None = None,
 ) -> Tensor:
-    """Largest rate, largest speed and number of wrong particles of each scene [B, 3]; no obstacles."""
+    """Largest rate, largest speed and number of invalid particles of each scene [B, 3]; no obstacles."""
     own = state.v.norm(dim=1)
     nearby = own if speed is None else torch.maximum(own, speed)
     inverse_inertia = bound * state.volume / state.mass
@@ -67,5 +67,5 @@ def deformation_rate(
 
 
 def known(rate: Tensor) -> Tensor:
-    """A rate that is not known limits nothing."""
+    """An unknown rate imposes no limit."""
     return rate.nan_to_num(nan=0.0, posinf=torch.inf)

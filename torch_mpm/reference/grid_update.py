@@ -1,4 +1,4 @@
-"""The grid update on whole lattices, one of each scene."""
+"""Grid update on full lattices, one for each scene."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def grid_update(
 
 
 def _image(lattice: Tensor, axis: int, twice: int) -> Tensor:
-    """What is behind a mirror at node twice/2 of an axis, seen in it: [B, ..., 1 + D]."""
+    """Image of a mirror at node twice/2 of an axis: [B, ..., 1 + D]."""
     count = lattice.shape[1 + axis]
     node = torch.arange(count, device=lattice.device)
     there = twice - node

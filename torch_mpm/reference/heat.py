@@ -108,7 +108,7 @@ def heat_cg(
         residual = torch.where(running, norm(r), residual)
         iterations = iterations + running.int()
         running = running & (residual > limit) & (iterations < most)
-    # A closed scene keeps its energy: Σ M d = dt Σ h, whatever the solve left over.
+    # A closed scene conserves its energy: Σ M d = dt Σ h, for any remaining residual.
     holding = held & ~(heat_capacity <= 0) & (blocks.node_scene() >= 0)
     open_to_outside = total((exchange != 0).to(x.dtype)) + zero.new_zeros(scenes).index_add(
         0, scene, holding.to(x.dtype)

@@ -1,4 +1,4 @@
-"""The energy of an implicit step in plain torch; its derivatives are those of autograd."""
+"""Energy of an implicit step in plain torch; its derivatives are computed by autograd."""
 
 from __future__ import annotations
 

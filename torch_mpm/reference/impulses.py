@@ -33,7 +33,7 @@ def _planes(dim: int) -> list[tuple[int, int]]:
 def wall_impulses(
     blocks: Topology, nodes: Tensor, gravity: Tensor | None, dt: float | Tensor | None, faces: Sequence[Face]
 ) -> Tensor:
-    """[B, 2 D, D + 1 or 3] without mirrors: what nodes lose when one face more closes."""
+    """[B, 2 D, D + 1 or 3] without mirrors: momentum lost by nodes when one more face closes."""
 
     def momentum(count: int) -> Tensor:
         closed = [*faces[:count], *(face._replace(kind="open", friction=0.0) for face in faces[count:])]
@@ -46,7 +46,7 @@ def wall_impulses(
 def contact_impulses(
     blocks: Topology, velocity: Tensor, mass: Tensor, obstacles: Sequence[Any], time: float | Tensor
 ) -> Tensor:
-    """[B, K, D + 1 or 3], from `Obstacle.apply` of one after another."""
+    """[B, K, D + 1 or 3], from `Obstacle.apply` of one obstacle after another."""
     positions, scene, found = blocks.node_positions(velocity.dtype), blocks.node_scene(), []
     for obstacle in obstacles:
         after = obstacle.apply(velocity, positions, scene if blocks.scenes > 1 else None, time, 0.0)

@@ -100,7 +100,7 @@ def per_particle(parameter: Tensor, scene: Tensor | None, particles: int) -> Ten
 
 
 def _at_meaningful(state: Tensor) -> tuple[Tensor, Tensor]:
-    """Which particles have a finite state of positive volume, and the state with the others at rest."""
+    """Particles with a finite state of positive volume, bool [P], and the state with the others at rest."""
     if state.dim() == 1:
         meaningful = (state > 0) & state.isfinite()
         return meaningful, torch.where(meaningful, state, 1)

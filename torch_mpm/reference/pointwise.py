@@ -1,4 +1,4 @@
-"""The functions of csrc/pointwise in plain torch: arguments and results as `torch_mpm.ops.pointwise` has them."""
+"""Functions of csrc/pointwise in plain torch, with the arguments and results of `torch_mpm.ops.pointwise`."""
 
 from __future__ import annotations
 

@@ -97,7 +97,7 @@ def _von_mises_flow(h: Tensor, p: Sequence[Tensor], q: Sequence[Tensor]) -> tupl
 
 
 def _bisect(residual: Callable[[Tensor], Tensor], low: Tensor, high: Tensor) -> Tensor:
-    """Where a residual that is negative at `low` and positive at `high` vanishes."""
+    """Zero of a residual that is negative at `low` and positive at `high`."""
     for _ in range(200):
         middle = (low + high) / 2
         positive = residual(middle) > 0
@@ -110,7 +110,7 @@ def _viscoplastic_flow(h: Tensor, p: Sequence[Tensor], q: Sequence[Tensor]) -> t
     trial = math.sqrt(2) * mu * _shear(h)[2]
     plastic = (trial > strength) & (mu * dt > 0)
 
-    def residual(rate: Tensor) -> Tensor:  # stress of the rate, and the elastic strain that it leaves
+    def residual(rate: Tensor) -> Tensor:  # Stress of the rate, and the remaining elastic strain.
         return strength + consistency * rate**exponent + mu * dt * rate - trial
 
     safe = torch.where(plastic, mu * dt, 1)
@@ -168,7 +168,7 @@ def _hencky_heat(
 def _von_mises_heat(
     h: Tensor, mapped: Tensor, p: Sequence[Tensor], before: Sequence[Tensor], after: Sequence[Tensor]
 ) -> Tensor:
-    """Plastic work less the work of hardening H ε̄ dε̄, both by backward Euler."""
+    """Plastic work minus the work of hardening H ε̄ dε̄, both by backward Euler."""
     return _hencky_heat(h, mapped, p, before, after) - p[3] * after[0] * (after[0] - before[0])
 
 
@@ -218,7 +218,7 @@ LAWS = {
 
 
 def _strains(F: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Which F have a meaning, and U, h, V of those; of the identity for the others."""
+    """Whether F is meaningful, and U, h, V of these; of the identity for the others."""
     meaningful = F.isfinite().all(2).all(1)
     meaningful = meaningful & (torch.linalg.det(torch.where(meaningful[:, None, None], F, 0)) > 0)
     safe = torch.where(meaningful[:, None, None], F, torch.eye(F.shape[1], dtype=F.dtype, device=F.device))

@@ -193,9 +193,10 @@ def dissipation(
     lam: Tensor,
     energy: str,
 ) -> Tensor:
-    """Energy [P] that the map turns into heat: the work of its stress on the plastic strain, and what is lost at once.
+    """Energy [P] that the map turns into heat: the work of its stress on the plastic strain, and the immediate loss.
 
-    At once goes the energy of the strain at which sand tears [P], and at the apex of the unilateral energy all of it.
+    The immediate loss is the energy of the strain at which sand tears [P], and at the apex of the unilateral energy all
+    of it.
     """
     work = (principal_stress(mapped, mu, lam, energy) * (h - mapped)).sum(1)
     edge = tearing[:, None].expand_as(h)

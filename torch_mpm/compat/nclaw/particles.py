@@ -104,7 +104,7 @@ class MPMState:
 
 @dataclasses.dataclass
 class MPMInitData:
-    """How a body begins.
+    """Initial values of a body.
 
     Attributes:
         rho: density [kg/m³].
