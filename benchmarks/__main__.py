@@ -1,7 +1,7 @@
 """Run the benchmarks one after the other: `python -m benchmarks [--quick] [--device cpu|cuda] [--out DIRECTORY]`.
 
-Each is a process of its own; the exit status says whether all of them ended well. Without `--device`, all of them, on
-CUDA where there is a GPU; with `--device cuda` those that use it.
+Each is a separate process; the exit status is zero if all succeeded. Without `--device` all programs run, on CUDA where
+there is a GPU; with `--device cuda` only those that use it.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ ON_DEVICE = (
     "benchmarks.stability.law_dt",
     "benchmarks.stability.collapse",
 )
-"""Programs that take --device; the others run on the CPU."""
+"""Programs with --device; the others run on the CPU."""
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""What every benchmark shares: where it ran, and files of results."""
+"""Common parts of benchmarks: environments, and result files."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ RESULTS = Path(__file__).parent / "results"
 
 
 def use_all_cores() -> int:
-    """Let torch use every core that this process may run on; return how many."""
+    """Let torch use every core available to this process; returns their number."""
     torch.set_num_threads(len(os.sched_getaffinity(0)))
     return torch.get_num_threads()
 
 
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
-    """For small scenes on a busy machine, whose threads would wait for each other."""
+    """Context for small scenes on a busy machine, where threads would wait for each other."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -37,9 +37,9 @@ def one_thread() -> Iterator[None]:
 
 
 def release_memory() -> None:
-    """Give freed memory back to the system.
+    """Return freed memory to the system.
 
-    The heap of glibc before 2.38 fragments without end under aligned allocations (glibc bug 14581): a rollout of
+    The heap of glibc before 2.38 fragments without bound under aligned allocations (glibc bug 14581): a rollout of
     large tensors on the CPU then takes gigabytes.
     """
     libc = ctypes.CDLL(None)
@@ -48,7 +48,7 @@ def release_memory() -> None:
 
 
 def environment(device: str = "cpu", devices: int = 1) -> dict[str, Any]:
-    """Device, or how many of it, versions, commit and date of a result."""
+    """Device and number of devices, versions, commit and date of a result."""
     import torch_mpm.info
 
     build = torch_mpm.info.info()
@@ -72,7 +72,7 @@ def environment(device: str = "cpu", devices: int = 1) -> dict[str, Any]:
 
 
 def device_name(device: str) -> str:
-    """Name of the processor or GPU, as its maker gives it."""
+    """Name of the processor or GPU from its manufacturer."""
     if torch.device(device).type == "cuda":
         return torch.cuda.get_device_name(device)
     try:
@@ -83,7 +83,7 @@ def device_name(device: str) -> str:
 
 
 def commit() -> str:
-    """What TORCH_MPM_COMMIT says, for a tree that is not git's; else its commit, "-dirty" where files differ."""
+    """TORCH_MPM_COMMIT, for a tree outside git; otherwise the commit, "-dirty" where files differ."""
     if given := os.environ.get("TORCH_MPM_COMMIT"):
         return given
     try:
@@ -123,7 +123,7 @@ def compact(value: Any, indent: str = "") -> str:
 
 
 def read(directory: Path, pattern: str) -> list[dict[str, Any]]:
-    """The results in a directory whose file names match, in the order of these names."""
+    """Results of a directory with matching file names, in the order of these names."""
     return [json.loads(file.read_text()) for file in sorted(directory.glob(pattern))]
 
 

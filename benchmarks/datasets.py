@@ -1,4 +1,4 @@
-"""Time of generating data sets, files included, and how busy the device is meanwhile.
+"""Time of generating data sets, including files, and utilisation of the device.
 
     python -m benchmarks.datasets                      # CPU: some scenes of the presets
     python -m benchmarks.datasets --device cuda        # also the size of DeepMind's Sand set: 1000 scenes of 2000
@@ -6,9 +6,9 @@
     python -m benchmarks.datasets --device cuda --large  # 32 such sets in one: a long run, several GPUs
     python -m benchmarks.datasets --out DIRECTORY --work FOLDER
 
-Each data set is generated in a process of its own, from the start of Python to the last byte on the disk of FOLDER. The
-share of time in which the GPU runs a kernel is what nvidia-smi samples every 100 ms between the first and the last
-frame (its utilization), where there is nvidia-smi, over the GPUs that CUDA_VISIBLE_DEVICES names, or all.
+Each data set is generated in a separate process, from the start of Python to the last byte on the disk of FOLDER. The
+share of time in which the GPU runs a kernel is sampled by nvidia-smi every 100 ms between the first and the last frame
+(its utilization), where nvidia-smi is available, over the GPUs in CUDA_VISIBLE_DEVICES, or all.
 """
 
 from __future__ import annotations
@@ -55,12 +55,12 @@ LARGE = [
 ]  # fmt: skip
 """As `SETS`; 126 GB."""
 PEER = {"water_drop": "water", "sand": "sand"}
-"""Presets of which `datasets_peer` makes scenes one by one, and what of."""
+"""Presets whose scenes `datasets_peer` simulates one by one, and their kinds."""
 QUICK = ["dataset.splits={train=4}", "dataset.scenes_per_shard=2", "dataset.frames=4"]
 
 
 def generate(preset: str, overrides: list[str], device: str, folder: Path) -> dict[str, Any]:
-    """Generate a data set in this process; what the others read from its output."""
+    """Generate a data set in this process; prints the values that the others read."""
     from torch_mpm.data.configuration import Configuration
     from torch_mpm.data.folder import DatasetFolder
     from torch_mpm.data.generate import generate
@@ -88,7 +88,7 @@ def generate(preset: str, overrides: list[str], device: str, folder: Path) -> di
 
 
 def measured(name: str, preset: str, overrides: list[str], device: str, work: Path, processes: int) -> dict[str, Any]:
-    """One data set in processes of its own."""
+    """One data set in separate processes."""
     folder = work / "set"
     shutil.rmtree(folder, ignore_errors=True)
     words = [sys.executable, "-m", "benchmarks.datasets", "--one", json.dumps([preset, overrides, device, str(folder)])]
@@ -108,7 +108,7 @@ def measured(name: str, preset: str, overrides: list[str], device: str, work: Pa
     rows = [json.loads(output.splitlines()[-1]) for output, _ in outputs]
     rows.sort(key=lambda r: (r["valid"], r["complete"]))
     marks = [when for row in rows for when in row.pop("between")]
-    row = {**rows[-1], "processes": len(rows)}  # the data set as the last one saw it, and the time of the slowest
+    row = {**rows[-1], "processes": len(rows)}  # The data set after the last process, and the time of the slowest.
     row |= {key: max(r[key] for r in rows) for key in ("seconds", "simulating", "waiting")}
     busy = [value for when, value in samples if min(marks) <= when <= max(marks)]
     shutil.rmtree(folder)
@@ -116,7 +116,7 @@ def measured(name: str, preset: str, overrides: list[str], device: str, work: Pa
 
 
 def peer(row: dict[str, Any], material: str, device: str) -> float | None:
-    """Time per frame and scene of a script in Taichi [s]; None where Taichi is not there."""
+    """Time per frame and scene of a script in Taichi [s]; None without Taichi."""
     particles = str(row["particles"] // max(row["valid"], 1))
     words = [sys.executable, "-m", "benchmarks.datasets_peer", material, "--device", device, "--particles", particles]
     done = subprocess.run(words, cwd=common.ROOT, capture_output=True, text=True)
@@ -127,7 +127,7 @@ def peer(row: dict[str, Any], material: str, device: str) -> float | None:
 
 
 def _environments(processes: int) -> list[dict[str, str]]:
-    """As torchrun sets them."""
+    """Environment variables of torchrun."""
     if processes == 1:
         return [dict(os.environ)]
     counts = {"WORLD_SIZE": str(processes), "LOCAL_WORLD_SIZE": str(processes), "OMP_NUM_THREADS": "1"}
@@ -135,7 +135,7 @@ def _environments(processes: int) -> list[dict[str, str]]:
 
 
 def _sampler() -> subprocess.Popen[str] | None:
-    """nvidia-smi, which tells the utilization of each GPU every 100 ms."""
+    """nvidia-smi, which samples the utilization of each GPU every 100 ms."""
     query = ["nvidia-smi", "--query-gpu=timestamp,utilization.gpu", "--format=csv,noheader,nounits", "-lms", "100"]
     if gpus := os.environ.get("CUDA_VISIBLE_DEVICES"):
         query += ["--id", gpus]
@@ -157,7 +157,7 @@ def _samples(sampler: subprocess.Popen[str] | None) -> list[tuple[float, float]]
             moment = time.mktime(time.strptime(when.strip().partition(".")[0], "%Y/%m/%d %H:%M:%S"))
             found.append((moment + float("0." + when.strip().partition(".")[2]), float(value)))
         except ValueError:
-            continue  # a line that was cut off, or a device that does not tell
+            continue  # A truncated line, or a device without this value.
     return found
 
 

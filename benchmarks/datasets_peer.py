@@ -1,4 +1,4 @@
-"""The scenes of a data set in Taichi, one after the other, as scripts do it: `python -m benchmarks.datasets_peer sand`.
+"""Scenes of a data set in Taichi, one after the other, as in scripts: `python -m benchmarks.datasets_peer sand`.
 
 MLS-MPM with APIC transfers on a dense grid in two dimensions: update of the deformation, stress and P2G with atomic
 adds, grid update with walls, G2P and advection, one call of a kernel per substep; positions go to an array after each
@@ -22,12 +22,12 @@ N, WALL = 80, 8
 """Cells along each axis of the unit square, and those behind each wall: dx = .0125 m in a domain from .1 to .9 m."""
 INTERVAL = 2.5e-3
 MATERIALS = {"water": {"density": 1e3, "substeps": 19}, "sand": {"density": 1.6e3, "substeps": 30}}
-"""Substeps per frame as torch_mpm chose them for the presets water_drop and sand."""
+"""Substeps per frame chosen by torch_mpm for the presets water_drop and sand."""
 BULK, E, NU, FRICTION_ANGLE, WALL_FRICTION = 5e5, 5e6, 0.3, 32.5, 0.5
 
 
 def program(material: str, device: str, particles: int) -> tuple[Callable[[], None], Any, Any, Callable[[], None]]:
-    """One substep, positions, velocities, and what sets the rest to the start of a scene."""
+    """One substep, positions, velocities, and a function that resets the other fields to the start of a scene."""
     import taichi as ti
 
     ti.init(arch=ti.cpu if device == "cpu" else ti.cuda, offline_cache=False, log_level=ti.WARN)

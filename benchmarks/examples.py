@@ -17,7 +17,7 @@ EXAMPLES = common.ROOT / "examples"
 
 
 def measure(path: Path, device: str) -> dict[str, Any]:
-    """Simulate a scene and keep what its summary says."""
+    """Simulate a scene and return its summary."""
     scene = mpm.Scene.load(path, [f'device="{device}"']).model_copy(update={"render": None})
     with tempfile.TemporaryDirectory() as folder:
         return {"name": path.stem, **scene.run(Path(folder) / path.stem)}

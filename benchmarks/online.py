@@ -1,9 +1,10 @@
-"""Training of examples/learn_simulator.py from a data set on disk and from scenes that are simulated meanwhile.
+"""Training of examples/learn_simulator.py from a data set on disk and from scenes that are simulated during training.
 
     python -m benchmarks.online --device cuda
 
-Both train the same network for as many steps and are tested with the same held-out windows. Simulation is the time in
-which scenes were simulated online, beside the training; its share is that of the whole time of training online.
+Both train the same network for the same number of steps, with the same held-out windows for tests. Simulation is the
+time in which scenes were simulated online, concurrently with the training; its share refers to the whole time of
+training online.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ def example() -> Any:
 
 
 class Timed:
-    """A function of scenes that adds up its time."""
+    """A function of scenes that accumulates its time."""
 
     def __init__(self, simulate: Any) -> None:
         self.simulate, self.seconds = simulate, 0.0
@@ -53,7 +54,7 @@ class Timed:
 
 
 def measure(device: str, steps: int, folder: Path) -> list[dict[str, Any]]:
-    """Both ways, after some steps that nobody counts."""
+    """Both ways, after some warm-up steps."""
     learn = example()
     config = learn.configuration(TRAINING_SCENES)
     generate(config, folder, device=device)
@@ -70,7 +71,7 @@ def measure(device: str, steps: int, folder: Path) -> list[dict[str, Any]]:
         torch.manual_seed(0)
         model = learn.Simulator(domain).to(device)
         begin = time.perf_counter()
-        learn.train(model, batches, count, lambda _: None)  # which waits for the device at its end
+        learn.train(model, batches, count, lambda _: None)  # It waits for the device at its end.
         seconds = time.perf_counter() - begin
         loss = learn.mean_loss(model, held_out)
         share = made.seconds / seconds

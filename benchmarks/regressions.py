@@ -10,14 +10,14 @@ from typing import Any
 from . import common
 
 SLOWER = 1.1
-"""Times the committed one."""
+"""Factor over the committed time."""
 
 Times = Callable[[dict[str, Any]], Iterable[tuple[str, float]]]
 """Names and times of the rows of a result."""
 
 
 def show(name: str, result: dict[str, Any], times: Times, directory: Path = common.RESULTS) -> None:
-    """Print what became slower than `name`.json in the directory, which is to be overwritten after this."""
+    """Print rows that became slower than those of `name`.json in the directory, before it is overwritten."""
     file = directory / f"{name}.json"
     if file.exists():
         for row, before, now in slower(json.loads(file.read_text()), result, times):

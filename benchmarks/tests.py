@@ -1,12 +1,12 @@
-"""Run the tests on a GPU machine and keep their outcome as a result: `python -m benchmarks.tests [TESTS ...]`.
+"""Run the tests on a GPU machine and store their outcome as a result: `python -m benchmarks.tests [TESTS ...]`.
 
     python -m benchmarks.tests                                   # the quick suite
     python -m benchmarks.tests --tool memcheck -k cuda tests/ops/test_transfer.py
     python -m benchmarks.tests --tool racecheck -k cuda --processes 12
 
-With `--tool` the tests run under compute-sanitizer, and an error that it finds fails the run. With `--processes`,
-so many run side by side and share the cores and the GPUs, each under a compute-sanitizer of its own; none takes more
-than a few tests then, because racecheck keeps host memory until its process ends. The result is written after each.
+With `--tool` the tests run under compute-sanitizer, and an error that it finds fails the run. With `--processes`, n
+processes run concurrently and share the cores and the GPUs, each under a separate compute-sanitizer; each runs only a
+few tests then, because racecheck retains host memory until its process ends. The result is written after each.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ from . import common
 
 COUNTS = ("tests", "failures", "errors", "skipped")
 SANITIZED_TESTS = {"memcheck": 16, "racecheck": 4, "initcheck": 16, "synccheck": 16}
-"""Tests of one process; racecheck takes some .1 GB per second."""
+"""Maximum number of tests of one process; racecheck takes some .1 GB per second."""
 Counts = dict[str, Any]
 Outcome = tuple[int, Counts | None]
 """The exit status of pytest, and the counts of its tests, None if it crashed."""
 
 
 def sanitized(tool: str) -> list[str]:
-    """The command in front of Python; PyTorch's own kernels are not looked into."""
+    """Command in front of Python; PyTorch's own kernels are excluded."""
     options = ["--error-exitcode", "9", "--target-processes", "all", "--print-limit", "20"]
     return ["compute-sanitizer", "--tool", tool, *options, "--kernel-regex", "kns=mpm"]
 
 
 def deal(command: list[str], processes: int, most: int | None) -> list[list[str]]:
-    """The tests that `command` selects, dealt out in turn to hands of at most `most` tests."""
+    """Tests selected by `command`, distributed in turn over groups of at most `most` tests."""
     listed = subprocess.run([*command, "--collect-only"], cwd=common.ROOT, capture_output=True, text=True)
     names = [line for line in listed.stdout.splitlines() if "::" in line]
     hands = min(len(names), max(processes, math.ceil(len(names) / most) if most else 0))
@@ -75,12 +75,12 @@ def run_hand(command: list[str], environment: dict[str, str], folder: Path, numb
 def run_side_by_side(
     tool: list[str], command: list[str], hands: list[list[str]], processes: int, folder: Path
 ) -> Iterator[dict[int, Outcome]]:
-    """The outcomes of all hands that have run so far, after each."""
+    """Outcomes of all groups that have run so far, after each."""
     command = [*tool, *command]
     environment = {**os.environ, "OMP_NUM_THREADS": str(max(1, (os.cpu_count() or 1) // processes))}
     if tool:  # memcheck loses a kernel that is loaded late and first launched by a graph: "misaligned address"
         environment["CUDA_MODULE_LOADING"] = "EAGER"
-        environment["TORCH_MPM_HOST_LOOPS"] = "1"  # loops of graphs are not followed (NVIDIA/warp issue 1406)
+        environment["TORCH_MPM_HOST_LOOPS"] = "1"  # Loops of graphs are not supported (NVIDIA/warp issue 1406).
     gpus = visible_gpus()
 
     def run(number: int) -> Outcome:
@@ -89,7 +89,7 @@ def run_side_by_side(
 
     outcomes: dict[int, Outcome] = {}
     unfinished = list(range(len(hands)))
-    # What a sanitizer's want of memory killed runs again with more of it; without one a crash is a crash.
+    # Groups killed for lack of memory of a sanitizer run again with more of it; without one a crash is a crash.
     for side_by_side in (processes, max(1, processes // 4)) if tool else (processes,):
         with ThreadPoolExecutor(side_by_side) as pool:
             started = {pool.submit(run, number): number for number in unfinished}
@@ -110,7 +110,7 @@ def counts_of(report: Path) -> Counts:
 
 
 def summary(outcomes: dict[int, Outcome]) -> dict[str, Any]:
-    """The worst exit status of the hands, their counts together, and the tests that did not pass."""
+    """Worst exit status of the groups, their total counts, and the tests that did not pass."""
     total: Counts = {**dict.fromkeys(COUNTS, 0), "failed": []}
     for number, (_, counts) in outcomes.items():
         for name, value in (counts or {"errors": 1, "failed": [f"hand {number}"]}).items():
@@ -154,7 +154,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         for outcomes in run_side_by_side(tool, command, hands, arguments.processes, Path(name)):
             result |= summary(outcomes) | {"seconds": time.monotonic() - start}
-            write(arguments.out, result)  # after each hand: what an interrupted run has found is kept
+            write(arguments.out, result)  # After each group: results survive an interruption.
     print("\n".join(f"Did not pass: {name}" for name in result.get("failed", [])))
     sys.exit(result["exit_status"])
 

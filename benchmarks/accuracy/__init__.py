@@ -1,1 +1,1 @@
-"""Errors against exact solutions and against float64, beside the run time they cost."""
+"""Errors against exact solutions and against float64, with their run times."""

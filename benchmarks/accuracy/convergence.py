@@ -9,11 +9,11 @@ Particles begin on a regular lattice; the body force, known at each material poi
 P2G, which is exact for APIC. Velocities belong to the middles of the steps ("staggered"): symplectic Euler is then the
 leapfrog scheme, of second order in dt. dt follows dx at a fixed CFL number. Errors: root of the mean square over
 particles of displacement and velocity at the end, relative to their amplitudes; "largest" is the largest displacement
-error of any particle.
+error of a particle.
 
-Two kinds of wall show what limits the order. With `walls="slip"` the nodes beyond a wall absorb the momentum that the
-kernel spreads there, and give back a velocity of zero: each is about half of an error of first order. "mirror" reflects
-the node values at the wall, so that the kernel finds there what it would in the middle of a body. Particles per cell
+Two kinds of wall show the limits of the order. With `walls="slip"` the nodes beyond a wall absorb the momentum that the
+kernel spreads there, and return a velocity of zero: each is about half of an error of first order. "mirror" reflects
+the node values at the wall, so that the kernel has the same values there as in the middle of a body. Particles per cell
 show the second limit: particles spread by the strain no longer integrate the kernel exactly, an error of the forces
 that does not shrink with dx. The cubic kernel and more particles lower it.
 """
@@ -43,7 +43,7 @@ CFL = 0.4
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """What is measured, on the lattices with `sizes` cells along each axis."""
+    """Cases, on the lattices with `sizes` cells along each axis."""
 
     dim: int
     kernel: str
@@ -128,7 +128,7 @@ def run(case: Case, n: int, steps: int | None = None, staggered: bool = True) ->
 
 
 def order_in_dt(case: Case, n: int, halvings: int) -> list[dict[str, Any]]:
-    """Errors at CFL number 1 and below, and what halving dt changes, free of the error of the lattice.
+    """Errors at CFL number 1 and below, and the change by halving dt, without the error of the lattice.
 
     With velocities in the middles of the steps ("staggered"), and at their beginnings.
     """

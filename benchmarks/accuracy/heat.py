@@ -2,10 +2,10 @@
 
 Cosine mode in an insulated square, Bessel mode in an insulated disc, a bar with a flux at one end, a sine mode between
 two walls that are held at a temperature, and a melting front from a hot wall (Stefan's problem), for both kernels and
-all transfers of temperature, on a lattice that fits none of the bodies. Particles are regular, 4 per cell, float64; the
-time step has a fixed diffusion number r, so that a method of second order shows order 2. Errors are relative: RMS of
-the temperature, distance of the front. The hybrid is APIC for r of 1/4 and more; the error of PIC does not shrink with
-dx but grows with 1/r.
+all transfers of temperature, on a lattice that is not aligned with any of the bodies. Particles are regular, 4 per
+cell, float64; the time step has a fixed diffusion number r, so that a method of second order shows order 2. Errors are
+relative: RMS of the temperature, distance of the front. The hybrid is APIC for r of 1/4 and more; the error of PIC does
+not shrink with dx but grows with 1/r.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ STEFAN = {0.1: 0.2200163, 0.5: 0.4647859, 1.0: 0.6200626}
 
 @dataclasses.dataclass(frozen=True)
 class Problem:
-    """A body with unit ρ, C and κ, and what its temperature should be.
+    """A body with unit ρ, C and κ, and its exact temperature.
 
     `setup` makes (grid, state, boundaries, error of an end state) for n cells per length, a kernel and the end time.
     """
@@ -132,7 +132,7 @@ def front(n: int, kernel: str, end: float, device: str) -> Any:
 
 
 FRONT = 0.4
-"""Where the melting front is at the end."""
+"""Position of the melting front at the end."""
 
 PROBLEMS = (
     Problem("cosine mode", cosine, 0.05, 0.1, (8, 16, 32, 48)),
@@ -166,7 +166,7 @@ def run(problem: Problem, n: int, kernel: str, transfer: str, device: str) -> di
 
 
 def small_steps(device: str) -> dict[str, Any]:
-    """Share of the change that float32 loses in 200 steps with a diffusion number of 1e-5, by what θ is relative to."""
+    """Share of the change that float32 loses in 200 steps with a diffusion number of 1e-5, by the reference of θ."""
     n, ends = 48, {}
     for name, dtype, offset in (
         ("exact", torch.float64, 0.0),

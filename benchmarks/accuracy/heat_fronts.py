@@ -24,13 +24,13 @@ from torch_mpm.heat.boundaries import FixedSurface
 from .. import common
 
 BEGIN, END = 0.15, 0.6
-"""Places of the front at the start and at the end."""
+"""Positions of the front at the start and at the end."""
 CASES = ((0.2, -0.4), (1.7, -0.1), (1.7, -0.4), (1.7, -1.0), (5.0, -0.4))
 """Stefan numbers and temperatures of the solid."""
 NUMBERS = (0.01, 0.1, 1.0, 10.0)
 SIZES = (20, 40)
 PLACES = (0.0, 0.13, 0.25, 0.37, 0.5, 0.75, 0.9)
-"""Of the held surfaces, in cells."""
+"""Offsets of the held surfaces, in cells."""
 LAYOUTS: tuple[dict[str, Any], ...] = (
     {}, {"kernel": "cubic"}, {"per_cell": 9}, {"per_cell": 1}, {"transfer": "apic"}, {"transfer": "flip"},
 )  # fmt: skip
@@ -58,7 +58,7 @@ def exact(x: Tensor, time: float, stefan: float, solid: float) -> Tensor:
 
 
 def lag(stefan: float, solid: float, n: int, number: float) -> float:
-    """How far the front is behind that of the exact solution at the end, over dx."""
+    """Distance of the front behind that of the exact solution at the end, over dx."""
     dx, factor = 1 / n, root(stefan, solid)
     start, end = ((place / (2 * factor)) ** 2 for place in (BEGIN, END))
     grid = mpm.Grid(dx, (-6 * dx, 0), (3, 6 * dx))

@@ -29,7 +29,9 @@ TRANSFERS = (("apic", 0.0), ("pic", 0.0), ("flip", 1.0), ("pic", 0.95), ("apic",
 
 
 def angular_momentum(step: mpm.Step, state: mpm.State) -> float:
-    """About the origin, with the affine velocities where they are transferred (Jiang et al. 2015) [kg m²/s]."""
+    """Angular momentum about the origin, with the affine velocities where they are transferred (Jiang et al. 2015) [kg
+    m²/s].
+    """
     x, v = state.x, state.v
     spin = x[:, 0] * v[:, 1] - x[:, 1] * v[:, 0]
     if step.transfer == "apic" and state.C is not None:
@@ -44,7 +46,7 @@ def disc(n: int, radius: float) -> tuple[mpm.Grid, mpm.State]:
 
 
 def spin(transfer: str, flip: float, stress_form: str, steps: int) -> dict[str, Any]:
-    """What is left of the momenta and the energy of a spinning disc, whose rim moves at 1 m/s."""
+    """Remaining momenta and energy of a spinning disc, whose rim moves at 1 m/s."""
     grid, state = disc(16, 0.25)
     arm = (state.x - 0.5) / 0.25
     spinning = torch.stack([-arm[:, 1], arm[:, 0]], 1)
@@ -68,13 +70,13 @@ def spin(transfer: str, flip: float, stress_form: str, steps: int) -> dict[str, 
 
 
 def _total(step: mpm.Step, state: mpm.State) -> float:
-    """Kinetic and elastic energy [J]; the affine velocities count where they are transferred."""
+    """Kinetic and elastic energy [J], including affine velocities where they are transferred."""
     seen = state if step.transfer == "apic" else state.replace(C=None)
     return energy(step, seen) - GRAVITY * float((state.mass * state.x[:, 1]).sum())
 
 
 def bounce(n: int) -> dict[str, Any]:
-    """Energy left after a disc has hit the floor at 1 m/s, a tenth of its speed of sound."""
+    """Remaining energy after a disc has hit the floor at 1 m/s, a tenth of its speed of sound."""
     grid, state = disc(n, 0.2)
     state = state.replace(
         v=torch.tensor([0.0, -1.0], dtype=torch.float64).expand_as(state.x), x=state.x - state.x.new_tensor([0, 0.2])
@@ -89,7 +91,7 @@ def bounce(n: int) -> dict[str, Any]:
 
 
 def incline(n: int, modulus: float, frictions: Sequence[float], duration: float = 1.0) -> list[dict[str, Any]]:
-    """Speed of blocks on a plane of 30° after some time [m/s], beside that of a rigid block.
+    """Speed of blocks on a plane of 30° after some time [m/s], and that of a rigid block.
 
     They settle first, damped by PIC, under the part of gravity that is normal to the plane.
     """

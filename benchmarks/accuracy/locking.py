@@ -1,8 +1,8 @@
 """Locking of nearly incompressible bodies: `python -m benchmarks.accuracy.locking [--quick] [--out FOLDER]`.
 
 The static sag of a cantilever under its weight over that of Timoshenko's theory (plane strain in 2-D), for Poisson's
-ratios, cells across its height, kernels, particles per cell, slenderness and places between the nodes, float64. Beside
-it stands the least share that the report of `torch_mpm.locking` gives.
+ratios, cells across its height, kernels, particles per cell, slenderness and places between the nodes, float64. The
+minimum share according to `torch_mpm.locking` is given for comparison.
 """
 
 from __future__ import annotations

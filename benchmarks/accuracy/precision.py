@@ -5,8 +5,8 @@
 
 Both begin with the same numbers, exact in float32, and take the same time steps. Rounding is the distance between them:
 root of the mean square over particles of positions [in dx] and velocities [over the speed of impact], and the change of
-energy [over the kinetic energy of impact]. Beside it stands the error of the lattice, the distance of the height of the
-mass centre from that on the finest lattice, so that the two can be weighed.
+energy [over the kinetic energy of impact]. The error of the lattice, the distance of the height of the mass centre from
+that on the finest lattice, is given for comparison.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from .. import common
 GRAVITY, IMPACT = 9.8, 2.0
 DENSITY, E, NU = 1000.0, 1e5, 0.3
 DURATION, RECORDS = 0.25, 5
-"""[s], long enough to fall 0.125 m onto the floor and leave it again; times at which the two are compared."""
+"""Duration [s], long enough to fall 0.125 m onto the floor and leave it again; times of the comparison."""
 CFL = 0.4
 
 

@@ -3,19 +3,19 @@
     python -m benchmarks.accuracy.ritter             # 3 minutes on a GPU; on 4 cores 10, without the fine lattices
     python -m benchmarks.accuracy.ritter --quick     # seconds
 
-Water of depth h0 stands behind x = 0 and is let go over a frictionless floor. Shallow water theory (Ritter 1892) has
+Water of depth h0 behind x = 0 is released over a frictionless floor. Shallow water theory (Ritter 1892) has
 
     h(x, t) = (2 c − x/t)²/(9 g) for −c t ≤ x ≤ 2 c t, c = √(g h0); t* = t √(g/h0); the dry front is 2 c t.
 
-The front of a depth e h0 is the foremost place where the water is as deep as that; Ritter's is at (2 − 3 √e) c t. Its
-error is the distance between the two over the distance of the dry front, 2 c t. Depth is the area of the particles in
-strips, each 1% of 2 c t wide.
+The front of a depth e h0 is the foremost position with that depth; Ritter's is at (2 − 3 √e) c t. Its error is the
+distance between the two over the distance of the dry front, 2 c t. Depth is the area of the particles in strips, each
+1% of 2 c t wide.
 
-What can agree: theory takes the pressure as hydrostatic, which it is not while the water falls. In this first phase, a
-few √(h0/g), the wave falls behind by about h0, and a thin horizontal jet leaves the foot of the dam (Stansby, Chegini
-and Barnes, J. Fluid Mech. 374 (1998) 407; Castro-Orgaz and Chanson, Environ. Fluid Mech. 17 (2017) 665, on the first
-phase), after which the two agree. A displacement of h0 is 3% of 2 c t at t* = 17, so errors are judged from t* = 20 on.
-The jet, which theory does not have, stays ahead for ever, thinner and thinner: "tip" is the foremost particle. Fronts
+Expected agreement: theory assumes a hydrostatic pressure, which does not hold while the water falls. In this first
+phase, a few √(h0/g), the wave lags behind by about h0, and a thin horizontal jet leaves the foot of the dam (Stansby,
+Chegini and Barnes, J. Fluid Mech. 374 (1998) 407; Castro-Orgaz and Chanson, Environ. Fluid Mech. 17 (2017) 665, on the
+first phase), after which both agree. A displacement of h0 is 3% of 2 c t at t* = 17, so errors are evaluated from t* =
+20 on. The jet, which is not part of the theory, stays ahead and becomes thinner: "tip" is the foremost particle. Fronts
 of 1% of h0 and more are behind it by then.
 """
 
@@ -44,7 +44,7 @@ CFL = 0.4
 LEVELS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.4)
 """Depths of the fronts over h0."""
 JUDGED = 20.0
-"""t* from which errors are judged."""
+"""t* from which errors are evaluated."""
 STRIPS = 100
 """Strips between the dam and the dry front."""
 
@@ -78,21 +78,21 @@ class Case:
 
 
 def setup(case: Case, device: str) -> tuple[mpm.Step, mpm.State]:
-    """The water at rest, with room for the waves that go up and down the channel."""
+    """Water at rest, with space for the waves in both directions of the channel."""
     behind, ahead = math.ceil(1.1 * case.duration), math.ceil(2.5 * case.duration)
     grid = mpm.Grid(DEPTH / case.n, (-behind * DEPTH, 0.0), (ahead * DEPTH, 1.5 * DEPTH), kernel=case.kernel)
     grid = mpm.Grid(grid.dx, grid.lower, grid.upper, kernel=case.kernel, max_blocks=grid.block_count)
     points = mpm.seed.box((-behind * DEPTH, 0.0), (0.0, DEPTH), grid, per_cell=case.per_cell)
     state = mpm.State.at_rest(points, DENSITY, dtype=torch.float32, device=device)
     bulk = DENSITY * (case.mach * 2 * SPEED) ** 2
-    pressure = DENSITY * GRAVITY * (DEPTH - state.x[:, 1])  # so that the dam break starts no sound
+    pressure = DENSITY * GRAVITY * (DEPTH - state.x[:, 1])  # The dam break then starts no sound.
     state = state.replace(J=(1 + GAMMA / bulk * pressure) ** (-1 / GAMMA), C=state.x.new_zeros(len(state), 2, 2))
     law = mpm.WeaklyCompressible(bulk, GAMMA)
     return mpm.Step(grid, law, (0.0, -GRAVITY), case.walls, transfer=case.transfer, flip=case.flip), state
 
 
 def run(case: Case, device: str, records: int) -> dict[str, Any]:
-    """The fronts at `records` equal intervals, the run time and, of cases that are drawn, the depths at the end."""
+    """Fronts at `records` equal intervals, the run time and, for cases in the figure, the depths at the end."""
     step, state = setup(case, device)
     interval = case.duration / records * UNIT
     sound = float(step.stable_dt(state, cfl=1.0))
@@ -121,7 +121,7 @@ def run(case: Case, device: str, records: int) -> dict[str, Any]:
 
 
 class Advance:
-    """Many equal steps, sorted now and then; on a GPU as replays of a graph."""
+    """Many equal steps, sorted periodically; on a GPU as replays of a graph."""
 
     CHUNK, SORTED = 25, 500
 
@@ -144,7 +144,7 @@ class Advance:
         return self.state
 
     def _keep(self, state: mpm.State) -> None:
-        """Make a state the current one; on a GPU in the same memory, which the graph reads and writes."""
+        """Set the current state; on a GPU in the same memory, which the graph reads and writes."""
         if not self.state.x.is_cuda:
             self.state = state
             return
@@ -153,7 +153,7 @@ class Advance:
 
     def _replay(self) -> None:
         if self.graph is None:
-            mpm.rollout(self.step, self.state, 3, self.dt)  # what the first call of an op sets up is not captured
+            mpm.rollout(self.step, self.state, 3, self.dt)  # One-time work of the first call of an op is not captured.
             self.step.reset()
             self.graph = torch.cuda.CUDAGraph()
             with torch.cuda.graph(self.graph):
@@ -189,7 +189,7 @@ def foremost(x: np.ndarray, depths: np.ndarray, level: float) -> float:
 
 
 def worst(case: dict[str, Any], level: float) -> float | None:
-    """The largest error of a front at the times that are judged."""
+    """Largest error of a front at the evaluated times."""
     errors = [abs(row["error"][str(level)]) for row in case["rows"] if row["time"] >= JUDGED - 1e-9]
     return max(errors, default=None)
 

@@ -3,7 +3,7 @@
     python -m benchmarks.accuracy.rollout_gradients             # minutes on 2 cores
     python -m benchmarks.accuracy.rollout_gradients --quick     # seconds
 
-Three problems in two dimensions, each with a loss of the end and several causes at once:
+Three problems in two dimensions, each with a loss of the end and several inputs together:
 
 - contact: an elastic block falls on a moving ball with friction and then to the floor; causes are its velocities, its
   stiffness, gravity, the place and the velocity of the ball, and the time step.
@@ -15,7 +15,7 @@ Three problems in two dimensions, each with a loss of the end and several causes
 Each cause has a scale. The directional derivative is that along a random direction of all causes together, times their
 scales, against central differences in float64. The error of float32 is the distance of the gradients times the scales,
 relative to that of float64; both begin with the same numbers, exact in float32. Growth is the largest norm of the
-gradient by a state on the way over that at the end, in the measure of `GradientNorms`.
+gradient by an intermediate state over that at the end, as in `GradientNorms`.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Problem:
         return dataclasses.replace(self, causes={name: value.to(device) for name, value in self.causes.items()})
 
     def loss(self, causes: Values, n: int, **options: Any) -> Tensor:
-        """A smooth function of where the particles are and how fast after n steps, of the order of one."""
+        """A smooth function of the positions and velocities of the particles after n steps, of the order of one."""
         step, state, dt = self.make(causes)
         end = mpm.rollout(step, state, n, dt, **options)
         weights = torch.linspace(-1, 1, len(end), dtype=F64).to(end.x)
@@ -66,7 +66,7 @@ class Problem:
         return place + (weights[:, None] * end.v).mean() + 0.1 * end.v.square().mean()
 
     def gradient(self, n: int, dtype: torch.dtype = F64, **options: Any) -> Tensor:
-        """Of the loss by all causes times their scales, one after another."""
+        """Gradient of the loss by all causes times their scales, one after another."""
         leaves = {name: value.to(dtype).requires_grad_() for name, value in self.causes.items()}
         grads = torch.autograd.grad(self.loss(leaves, n, **options), list(leaves.values()))
         return torch.cat([self.scales[k] * g.reshape(-1).double() for k, g in zip(leaves, grads, strict=True)])
@@ -91,7 +91,7 @@ def _block(cells: int, low: Sequence[float], dtype: torch.dtype) -> mpm.State:
 
 
 def _exact(value: Any) -> Tensor:
-    """float64 that float32 has too."""
+    """float64 values that are exact in float32."""
     return torch.as_tensor(value, dtype=torch.float32).double()
 
 
@@ -159,7 +159,7 @@ def directional_error(problem: Problem, n: int, gradient: Tensor) -> float:
 
 
 def growth(problem: Problem, n: int) -> tuple[float, int | None]:
-    """The largest norm of the gradient on the way over that at the end, and the suggested truncation."""
+    """Largest norm of the gradient by an intermediate state over that at the end, and the suggested truncation."""
     norms = mpm.GradientNorms(every=max(n // 50, 1))
     problem.gradient(n, norms=norms)
     total = norms.total()[:, 0]

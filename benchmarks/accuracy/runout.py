@@ -3,23 +3,24 @@
     python -m benchmarks.accuracy.runout                 # all cases, minutes on a GPU; the CPU does one batch only
     python -m benchmarks.accuracy.runout --quick         # seconds
 
-A column of height H and half width (radius) r₀ stands on a rough floor, on which sand sticks, and is let go; a = H/r₀.
-All aspect ratios of a case run as one batch of scenes with equal volume. "planar" is the 2-D law, "slab" the 3-D law in
+A column of height H and half width (radius) r₀ on a rough floor, to which sand sticks, is released; a = H/r₀. All
+aspect ratios of a case run as one batch of scenes with equal volume. "planar" is the 2-D law, "slab" the 3-D law in
 plane strain between frictionless walls, "axisymmetric" a quarter of a round column between frictionless walls of
 symmetry. The sand starts in the equilibrium of a confined column, and is stiff enough to be compressed by 2% at its
 foot. A run lasts 6 √(H/g).
 
-Run-out: (r − r₀)/r₀ for the least radius r at which the deposit is less deep than one grid cell; beside it the radius
-that holds 99% of the mass. Slope: the least-squares slope of the deposit between 20% and 80% of its height.
+Run-out: (r − r₀)/r₀ for the smallest radius r at which the deposit is less deep than one grid cell; also the radius
+that contains 99% of the mass. Slope: the least-squares slope of the deposit between 20% and 80% of its height.
 
 Published: planar 1.2 a below a = 2.3, 1.9 a^⅔ above (Lube et al. 2005); 2-D discs 2.5 a below 2, 3.25 a^0.7 above
 (Staron and Hinch 2005); axisymmetric 1.24 a below 1.7, 1.6 a^½ above (Lube et al. 2004). The factors depend on the
 material and on the side walls of the experiments; exponents in 0.9 ± 0.1 and, planar, 0.65 ± 0.05 are common to many
 materials (Balmforth and Kerswell 2005).
 
-Standing slopes: heaps with a plane flank from 20° to 50° stand against a frictionless wall, in one batch. One has
-failed if the mean displacement is more than 2% of its height after 4 √(H/g). Beside it the Mohr-Coulomb angle that the
-law mobilises in steady shear: the friction angle in 2-D, and in plane strain one that depends on energy and flow rule.
+Standing slopes: heaps with a plane flank from 20° to 50° stand against a frictionless wall, in one batch. A heap has
+failed if the mean displacement is more than 2% of its height after 4 √(H/g). Also given is the Mohr-Coulomb angle that
+the law mobilises in steady shear: the friction angle in 2-D, and in plane strain one that depends on energy and flow
+rule.
 """
 
 from __future__ import annotations
@@ -90,7 +91,7 @@ class Case:
         return f"{self.shape}{rule}, {self.energy}, φ = {self.friction_angle:g}°, {self.cells} cells{extra}"
 
     def unusual(self) -> list[str]:
-        """What differs from the usual in how it is computed."""
+        """Differences from the usual computation."""
         usual = Case(self.shape, self.cells)
         words = {
             "volume_correction": "volume correction",
@@ -133,7 +134,7 @@ VARIANTS = (
         )
     ),
 )
-"""What is computed for one aspect ratio only, to see on what the run-out depends."""
+"""Variants for one aspect ratio only, which show the sensitivity of the run-out."""
 VARIED = 2.0
 """Aspect ratio of the variants."""
 
@@ -192,7 +193,7 @@ def stiffness(height: float, compression: float) -> tuple[float, float]:
 
 
 def pressed(case: Case, points: Points, overburden: Tensor, height: float) -> mpm.State:
-    """Sand at rest under the depth `overburden` [P] [m] of sand above it, in a column confined from the sides."""
+    """Sand at rest under the depth `overburden` [P] [m] of sand, in a laterally confined column."""
     state = mpm.State.at_rest(points, DENSITY, dtype=torch.float64)
     mu, lam = stiffness(height, case.compression)
     strain = (DENSITY * GRAVITY * overburden.clamp(min=0) / (2 * QUARTIC * (2 * mu + lam))).pow(1 / 3)
@@ -204,7 +205,8 @@ def pressed(case: Case, points: Points, overburden: Tensor, height: float) -> mp
 def simulate(
     case: Case, states: Sequence[mpm.State], heights: Sequence[float], reach: float, duration: float, device: str
 ) -> tuple[mpm.State, list[dict[str, Any]], int]:
-    """All scenes to the time `duration` √(H/g); the final state, a record per unit of that time, the number of steps.
+    """Simulate all scenes to the time `duration` √(H/g); returns the final state, a record per unit of that time, and
+    the number of steps.
 
     The scenes share the clock t/√(H/g): it advances by the largest step that is stable in all of them.
     """
@@ -213,7 +215,7 @@ def simulate(
     grid = mpm.Grid(DX, (0.0,) * dim, upper, scenes=len(states), kernel=case.kernel)
     packed = mpm.State.concatenate(list(states), scene=True).to(device, torch.float32)
     wanted = grid.activate(packed.x, packed.scene).wanted
-    room = min(3 * wanted, grid.block_count)  # to spread; fixed, for the graph
+    room = min(3 * wanted, grid.block_count)  # Space to spread; fixed, for the graph.
     grid = mpm.Grid(DX, (0.0,) * dim, upper, scenes=len(states), kernel=case.kernel, max_blocks=room)
     moduli = [stiffness(h, case.compression) for h in heights]
     mu, lam = (torch.tensor(values, device=device) for values in zip(*moduli, strict=True))
@@ -245,10 +247,10 @@ class Segment:
     """SEGMENT steps in place; on a GPU, from the second call on, a CUDA graph.
 
     Args:
-        step: with a grid of fixed max_blocks.
-        state: at the start, with all that the step needs.
-        time_step: of a state, dt [B].
-        every_step: whether to ask for dt at every step, not once.
+        step: a step with a grid of fixed max_blocks.
+        state: initial state, with all fields that the step needs.
+        time_step: function of a state that returns dt [B].
+        every_step: whether to compute dt at every step, not once.
 
     Attributes:
         state, time: after the steps so far.
@@ -348,7 +350,7 @@ def flank_angle(depth: Tensor, distance: Tensor) -> float:
 
 
 def collapse(case: Case, aspects: Sequence[float], duration: float, device: str) -> dict[str, Any]:
-    """All columns of a case: what the deposits look like, and how energy and volume went."""
+    """All columns of a case: the deposits, and the history of energy and volume."""
     bodies = [column(case, a) for a in aspects]
     heights = [height for _, height, _ in bodies]
     states = [pressed(case, points, height - points.x[:, 1], height) for points, height, _ in bodies]
@@ -496,14 +498,14 @@ def added(old: dict[str, Any], new: dict[str, Any]) -> dict[str, Any]:
 
 
 def published(shape: str, a: float) -> float:
-    """Run-out that was measured."""
+    """Published run-out."""
     _, limit, wide, narrow = PUBLISHED[shape]
     factor, power = wide if a < limit else narrow
     return factor * a**power
 
 
 def slopes(result: dict[str, Any]) -> str:
-    """Table of the slopes that stand, beside the angle that the law mobilises."""
+    """Table of the stable slopes, with the angle that the law mobilises."""
     header = ("slope in plane strain", "steepest that stands [°]", "least steep that fails [°]", "mobilised [°]")
     rows = [
         (s["name"], s["steepest"], s["least failing"], f"{mobilised_angle(Case(**s['case'])):.1f}")

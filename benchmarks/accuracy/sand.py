@@ -2,9 +2,9 @@
 
 Random trial strains: |p| from 1e-8 to 0.5, overshoot of the yield surface from 1e-3 to 1e4, all Lode angles, friction
 angles 1° to 60°, ν from 0 to 0.49. The reference has the 64-bit mantissa of np.longdouble (x86), by bisection and
-Newton's method on equations written here, checked against mpmath with 50 digits on some of the states. What is compared
-is the map of strains as the CPU kernels compute it, in packs: the stretches of an F near the identity could not hold
-the smallest of these strains.
+Newton's method on equations written here, checked against mpmath with 50 digits on some of the states. The comparison
+is for the map of strains of the CPU kernels, in packs: the stretches of an F near the identity cannot represent the
+smallest of these strains.
 
 The error of h is divided by the condition of the root: the change of the reference under a relative change of each
 argument by 1e-13, over that change, at least 1. The yield residual is |y| over the sum of its terms.
@@ -28,7 +28,7 @@ Array = npt.NDArray[Any]
 LONG = np.longdouble
 CASES = (("full", "radial"), ("unilateral", "radial"), ("full", "exact"), ("unilateral", "exact"))
 TYPES = (("float32", np.float32, 2e-6), ("float64", np.float64, 1e-12))
-"""Names, types and the error that is allowed relative to the condition."""
+"""Names, types and the allowed error relative to the condition."""
 
 
 # ---- the equations, in units of |p| and 4aμ|p|³
@@ -211,7 +211,7 @@ def compare(count: int, energy: str, flow: str, checked: int) -> dict[str, Any]:
         h, alpha, ratio = (np.ascontiguousarray(a.astype(dtype)) for a in states)
         found, branch, steps = _math.sand_return_map(h, alpha, ratio, energy, flow)
         wide = [a.astype(LONG) for a in (h, alpha, ratio)]
-        negative = wide[0].sum(1) < 0  # rounding may have turned a strain into extension
+        negative = wide[0].sum(1) < 0  # Rounding may have changed a strain to extension.
         wide, result = [a[negative] for a in wide], found[negative].astype(LONG)
         branch, steps = branch[negative], steps[negative]
         mapped, outside = reference(*wide, unilateral, flow, _guess(wide, energy, flow))
@@ -246,7 +246,7 @@ def compare(count: int, energy: str, flow: str, checked: int) -> dict[str, Any]:
 
 
 def condition_of_mean(h: Array) -> Array:
-    """What cancellation in the mean strain does to the trial strain relative to it."""
+    """Effect of cancellation in the mean strain on the trial strain relative to it."""
     return np.abs(h).max(1) / np.abs(h.mean(1))
 
 

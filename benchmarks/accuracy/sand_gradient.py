@@ -1,11 +1,11 @@
 """float32 gradients of the return map of sand against float64: `python -m benchmarks.accuracy.sand_gradient`.
 
-Random trial states outside the cone of which two singular values differ by a given gap, with random axes: |p| over a
+Random trial states outside the cone with two singular values that differ by a given gap, with random axes: |p| over a
 decade below a given size, deviators of 0.3 to 30 |p|, all angles of loading. The gradient of random linear functions of
 the new F and of the stress, each on its own, at the float32 F; the reference is the float64 op at the same F. The error
 is relative to the norm of the gradient, and to its usual norm: the root mean square over random weights w of the same
-norm, |J| |w| / 3 with the Jacobian J of the 9 components. Beside it stands what one unit in the last place of F changes
-in the float64 gradient: an error far below is not an accident of the states.
+norm, |J| |w| / 3 with the Jacobian J of the 9 components. For comparison the change of the float64 gradient by one unit
+in the last place of F is given: an error far below is not an accident of the states.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def rotations(count: int, generator: torch.Generator) -> Tensor:
 
 
 def deformations(count: int, gap: float, size: float, generator: torch.Generator) -> Tensor:
-    """float32 [P, 3, 3] of which two singular values differ by `gap`, before F is rounded."""
+    """float32 [P, 3, 3] with two singular values that differ by `gap`, before F is rounded."""
 
     def uniform() -> Tensor:
         return torch.rand(count, 1, generator=generator, dtype=torch.float64)

@@ -1,10 +1,10 @@
-"""Implicit steps: where they converge, what they cost, and how wrong they are.
+"""Implicit steps: convergence, costs, and errors.
 
     python -m benchmarks.implicit               # all studies, some half an hour on 2 cores
     python -m benchmarks.implicit --only cost   # one of them
     python -m benchmarks.implicit --quick       # seconds
 
-Each study is a module of this package, whose docstring says what is done.
+Each study is a module of this package, described in its docstring.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ STUDIES: dict[str, tuple[Any, Callable[[bool, str, Path], Result]]] = {
     "multigrid": (multigrid, of_multigrid),
 }
 ON_DEVICE = ("cost", "crossover")
-"""Studies of speed alone, which run on CUDA; the others are of the method, on the CPU."""
+"""Studies of speed only, which run on CUDA; the others study the method, on the CPU."""
 
 
 def text(name: str, result: Result) -> str:

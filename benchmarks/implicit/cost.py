@@ -123,7 +123,7 @@ def seconds_of(step: mpm.Step, state: mpm.State, dt: float = 5e-3) -> float:
 
 
 def batches(device: str, quick: bool) -> list[dict[str, Any]]:
-    """Scenes of 128 particles, each with a stiffness of its own; some of them one by one stand for all."""
+    """Scenes of 128 particles with different stiffness; some of them one by one represent all."""
     scenes, some = (64, 4) if quick else (1024, 16)
 
     def scene(E: Tensor, count: int) -> tuple[mpm.Step, mpm.State]:

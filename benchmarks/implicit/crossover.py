@@ -29,7 +29,7 @@ E = 1e8
 
 
 def seconds_of(step: mpm.Step, state: mpm.State, n: int, dt: float) -> tuple[float, mpm.State]:
-    """Of each of n steps, the less of two runs."""
+    """Time of each of n steps, the smaller of two runs."""
     cuda = state.x.is_cuda
     clock = time.perf_counter if cuda else time.process_time
     times = []
@@ -68,7 +68,7 @@ def crossover(device: str, quick: bool) -> list[dict[str, Any]]:
 
 
 def fitted(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The constants, and the largest factor by which they miss a measured time."""
+    """The constants, and the largest factor between the fit and a measured time."""
     found = []
     for dim in (2, 3):
         own = [row for row in rows if row["dim"] == dim]
@@ -83,7 +83,7 @@ def fitted(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _least_squares(columns: list[Any], values: Any) -> tuple[list[float], float]:
-    """Coefficients that are not negative, and the largest factor between the fit and a value."""
+    """Non-negative coefficients, and the largest factor between the fit and a value."""
     from scipy.optimize import nnls
 
     matrix = np.stack(columns, 1)

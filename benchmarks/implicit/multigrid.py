@@ -59,7 +59,7 @@ def counts(s: System, p: Preconditioner) -> dict[float, int]:
 
 
 class Work:
-    """Answers the linear solves of a step, and adds up what they take."""
+    """Solver of the linear systems of a step, which accumulates their costs."""
 
     def __init__(self, name: str) -> None:
         self.name, self.iterations, self.cost, self.solves = name, 0, 0.0, 0
@@ -138,11 +138,11 @@ NAMES = ("blocks", "V(2, 2)", "additive", "patches", "scalar patches", "V(1, 1),
 
 
 class Enough(Exception):
-    """The first linear solve has been seen."""
+    """Raised after the first linear solve."""
 
 
 def first_system(case: Case) -> System:
-    """Of the first linear solve of a step."""
+    """Costs of the first linear solve of a step."""
     found = []
 
     def keep(*arguments: Any, **rest: Any) -> Any:

@@ -57,7 +57,7 @@ def column(cells: int, kernel: str, wall: str = "sticky") -> float:
 
 
 def beam(cells: int, kernel: str) -> float:
-    """Relative error of the sag of a cantilever of so many cells' height, clamped by a plane."""
+    """Relative error of the sag of a cantilever of a height in cells, clamped by a plane."""
     h, E, g = 0.1, 1e7, 0.05
     dx = h / cells
     grid = mpm.Grid(dx, (-0.2, -0.4), (1.1 + 2 * dx, 0.4), kernel=kernel)

@@ -1,4 +1,4 @@
-"""Preconditioners of the multigrid study, in scipy; the study says which they are and how their cost is counted."""
+"""Preconditioners of the multigrid study, in scipy; the study defines them and the counting of their cost."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ Linear = Callable[[Array], Array]
 LIGHT = 0.2
 """Share of the heaviest node below which one is light."""
 COARSEST = {2: 60, 3: 300}
-"""Unknowns below which a level is solved."""
+"""Number of unknowns below which a level is solved."""
 COARSE_DEGREE = 2
 VECTORS = 0.13
 """Cost of the vectors of an iteration with node blocks, in products (cost.py)."""
 ASSEMBLY = {2: 4.0, 3: 14.0}
-"""Of a matrix from the particles, in products."""
+"""Cost of assembling a matrix from the particles, in products."""
 MOST = 4000
-"""Iterations."""
+"""Maximum number of iterations."""
 
 
 @dataclasses.dataclass
 class System:
-    """A x = b of the components that may move.
+    """A x = b of the free components.
 
     Attributes:
         A: [n, n]; b: [n].
@@ -91,7 +91,7 @@ def assembled(
 
 @dataclasses.dataclass
 class Preconditioner:
-    """Of one system; cost of an iteration without its product, and of the set-up, in products."""
+    """Preconditioner of one system; cost of an iteration without its product, and of the set-up, in products."""
 
     apply: Linear
     cost: float
@@ -132,7 +132,7 @@ def node_blocks(A: Array, node: Array, component: Array, nodes: int, dim: int) -
 
 
 def interpolation(lattice: Array) -> tuple[Array, Array]:
-    """From the lattice of even nodes, linear; and coordinates of the nodes that it has."""
+    """Linear interpolation from the lattice of even nodes; and coordinates of its nodes."""
     parts = []
     for offset in itertools.product((-1, 0, 1), repeat=lattice.shape[1]):
         near = np.flatnonzero(((lattice - offset) % 2 == 0).all(1))

@@ -32,7 +32,7 @@ SIDE, DENSITY, NU, SPEED = 0.2, 1000.0, 0.45, 0.01
 MODULI = (1e6, 1e7, 1e8, 1e9)
 CELLS = 16
 STEPS = (5, 10, 20, 50, 100)
-"""Implicit steps of a second."""
+"""Numbers of implicit steps in a second."""
 StepOf = Callable[..., mpm.Step]
 
 
@@ -51,7 +51,7 @@ def gripper(E: float, cells: int = CELLS, dtype: torch.dtype = torch.float64, di
 
 
 def taken(step: mpm.Step, state: mpm.State, n: int, duration: float = 1.0) -> tuple[mpm.State, float]:
-    """The state after n steps, and the time of the faster of two runs, or of one that is long."""
+    """State after n steps, and the time of the faster of two runs, or of a single long one."""
     least = float("inf")
     with torch.no_grad():
         for _ in range(2):
@@ -72,7 +72,7 @@ def displacement(state: mpm.State, end: mpm.State) -> Tensor:
 
 
 def on_coarse(fine: mpm.State, values: Tensor, coarse: mpm.State) -> Tensor:
-    """Means of the values of the four fine particles in the place of each coarse one at rest."""
+    """Means of the values of the four fine particles at the position of each coarse one at rest."""
     spacing = SIDE / CELLS / 2
 
     def number(x: Tensor) -> Tensor:
@@ -117,7 +117,9 @@ def squeeze(quick: bool) -> list[dict[str, Any]]:
 
 
 def at_equal_error(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The fastest implicit run in float64 whose error in time is lost in that of the lattice, and that with 1%."""
+    """The fastest implicit run in float64 whose time error is small compared with that of the lattice, and that with
+    1%.
+    """
     found = []
     for E in dict.fromkeys(row["E"] for row in rows):
         own = [row for row in rows if row["E"] == E and row["dtype"] == "float64"]

@@ -1,1 +1,1 @@
-"""Time of a step and of its parts, beside the copy bandwidth of the device and beside other programs."""
+"""Time of a step and of its parts, compared with the copy bandwidth of the device and with other programs."""

@@ -1,14 +1,14 @@
-"""What checkpoints of rollouts save and cost, and whether the estimate knew it.
+"""Memory and time of checkpoints of rollouts, and accuracy of the estimate.
 
     python -m benchmarks.speed.checkpoints [--device cuda]      # minutes
     python -m benchmarks.speed.checkpoints --quick              # seconds
 
-A block of a neo-Hookean solid falls in three dimensions for some steps, and the gradient of where it ends is taken by
-its velocities: once with the compiled law, whose steps are taken in one op, and once with that law in torch code, a
-step at a time. Memory is the peak above that before the rollout: on CUDA that of PyTorch's allocator, on the CPU that
-of the tensors that ops return, which does not show what the op of many steps holds inside. The estimate is that of
-`estimate_rollout` with the same arguments; it knows neither the loss nor the working memory of the backward pass of a
-step.
+A block of a neo-Hookean solid falls in three dimensions for some steps, and the gradient of its final position by its
+velocities is computed: once with the compiled law, whose steps are computed in one op, and once with that law in torch
+code, one step at a time. Memory is the peak above that before the rollout: on CUDA that of PyTorch's allocator, on the
+CPU that of the tensors that ops return, which excludes the internal memory of the op of many steps. The estimate is
+that of `estimate_rollout` with the same arguments; it includes neither the loss nor the working memory of the backward
+pass of a step.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def case(law: str, name: str, cells: int, n: int, device: str) -> dict[str, Any]
     else:
         taken = memory.of_returned_tensors(run) if law != "compiled" else None
     begin = time.perf_counter()
-    assert bool(run().isfinite().all())  # which waits for the device
+    assert bool(run().isfinite().all())  # It waits for the device.
     seconds = time.perf_counter() - begin
     return {
         "law": law, "kept": name, "particles": len(state), "memory": taken, "seconds": seconds,

@@ -32,7 +32,7 @@ CELLS = {"cpu": 24, "cuda": 100}
 SCENES, SCENE_SIDE, SCENE_CELLS = 1024, 17, 32
 LARGE = (1e2, 1e4, 1e6)
 CHUNK = 1_000_000
-"""Particles whose share of the matrix is added at once."""
+"""Number of particles whose share of the matrix is added at once."""
 
 
 class Problem:

@@ -1,8 +1,8 @@
-"""Substeps of MPM by kernels of Warp without gradients, as simulators that move Gaussians take them.
+"""Substeps of MPM by kernels of Warp without gradients, as in simulators that move Gaussians.
 
 The algorithm is that of PhysGaussian (Xie et al. 2024) for its "jelly": fixed corotated stress of a decomposition, P2G
-by the gradient of quadratic B-splines with APIC and atomic adds onto a dense grid, F moved by ∇v; a launch for each.
-Arrays are tensors of torch, whose allocator so tells the memory.
+by the gradient of quadratic B-splines with APIC and atomic adds onto a dense grid, F updated by ∇v; a launch for each.
+Arrays are tensors of torch, so that its allocator measures the memory.
 """
 
 from __future__ import annotations

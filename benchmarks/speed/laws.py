@@ -1,8 +1,8 @@
 """Times of the laws: `python -m benchmarks.speed.laws [--device cuda]`.
 
 float32, 3-D, structure of arrays, states of which about half flow: return map with stress and history, with the
-dissipated energy, and its backward pass with the gradients of F, parameters and history. Of memory: the time in which
-as many bytes as the update must read and write are copied or read, whichever is faster, over that of the update.
+dissipated energy, and its backward pass with the gradients of F, parameters and history. "of memory": the time to copy
+or read, whichever is faster, the bytes that the update must read and write, over the time of the update.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Memory that some work takes at its peak, in three ways."""
+"""Peak memory of some work, measured in three ways."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Work = Callable[[], Any]
 
 
 class LiveTensors(TorchDispatchMode):
-    """The largest sum of the sizes of tensors that ops have returned and that are still there [bytes]."""
+    """Largest sum of the sizes of living tensors that ops have returned [bytes]."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -44,14 +44,14 @@ class LiveTensors(TorchDispatchMode):
 
 
 def of_returned_tensors(work: Work) -> int:
-    """Of tensors that ops return, on any device; what an op takes inside is not seen [bytes]."""
+    """Memory of tensors that ops return, on any device; internal memory of ops is not included [bytes]."""
     with LiveTensors() as tensors:
         work()
     return tensors.most
 
 
 def of_cuda(work: Work) -> int:
-    """Of PyTorch's allocator on CUDA, above what was allocated before [bytes]."""
+    """Memory of PyTorch's allocator on CUDA, above that allocated before [bytes]."""
     torch.cuda.synchronize()
     torch.cuda.empty_cache()
     torch.cuda.reset_peak_memory_stats()
@@ -62,9 +62,9 @@ def of_cuda(work: Work) -> int:
 
 
 class Resident:
-    """Resident memory of this process, above that when this was made [bytes].
+    """Resident memory of this process, above that at the creation of this object [bytes].
 
-    What allocators keep from earlier work counts, as far as it was not used again. Needs Linux's /proc/self/clear_refs.
+    Memory that allocators retain from earlier work counts, unless it was reused. Needs Linux's /proc/self/clear_refs.
     """
 
     available = os.access("/proc/self/clear_refs", os.W_OK)
@@ -76,7 +76,7 @@ class Resident:
     def peak(self, work: Work) -> int:
         gc.collect()
         common.release_memory()
-        Path("/proc/self/clear_refs").write_text("5")  # the peak is that of now
+        Path("/proc/self/clear_refs").write_text("5")  # The peak is now the present memory.
         work()
         return self._read("VmHWM") - self._before
 

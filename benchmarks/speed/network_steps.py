@@ -1,4 +1,4 @@
-"""Steps with a network as their law: one by one, compiled, and from CUDA graphs. A part of `training`."""
+"""Steps with a network as their law: one by one, compiled, and from CUDA graphs. Part of `training`."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from .. import common
 from .rollouts import least
 
 DX, DT, STEPS = 1 / 32, 1e-4, 8
-"""[m], [s], and steps in a row."""
+"""Node distance [m], time step [s], and number of consecutive steps."""
 WIDTH = 64
-"""Of the layers of the network."""
+"""Width of the layers of the network."""
 
 Advance = Callable[[mpm.State], mpm.State]
 
 
 class Law(nn.Module):
-    """F [P, 3, 3] -> Kirchhoff stress F S Fᵀ [Pa], with S of a network that is given the strain."""
+    """F [P, 3, 3] -> Kirchhoff stress F S Fᵀ [Pa], with S computed by a network from the strain."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -37,7 +37,7 @@ class Law(nn.Module):
 
 
 def setup(cells: Sequence[int], device: str) -> tuple[mpm.Step, mpm.State]:
-    """A block of so many cells along its edges, 8 particles in each, and a smooth velocity with a gradient."""
+    """A block with a number of cells along its edges, 8 particles in each, and a smooth velocity with a gradient."""
     grid = mpm.Grid(DX, (0, 0, 0), (1, 1, 1), max_blocks=9**3)
     points = mpm.seed.box((8 * DX,) * 3, tuple((8 + count) * DX for count in cells), grid, per_cell=8)
     torch.manual_seed(0)
@@ -53,7 +53,7 @@ def eager(step: nn.Module) -> Advance:
 
 
 def gradients(advance: Advance, step: nn.Module, state: mpm.State) -> list[Tensor]:
-    """Where the state ends, and the gradient of that by velocities and weights."""
+    """Final state, and its gradient by velocities and weights."""
     end = advance(state)
     found = torch.autograd.grad(end.x.square().sum() + end.v.square().sum(), [state.v, *step.parameters()])
     return [end.x.detach(), end.v.detach(), *found]
@@ -65,8 +65,9 @@ def error(values: Sequence[Tensor], reference: Sequence[Tensor]) -> float:
 
 
 def rows(cells: Sequence[int], device: str, samples: int, backend: str) -> Iterator[dict[str, Any]]:
-    """Of every way to take the steps: the time until it could begin, least times of the forward pass without gradients
-    and of both passes [s], and how far it is from steps one by one."""
+    """For each way to compute the steps: start-up time, minimum times of the forward pass without gradients and of both
+    passes [s], and difference from steps one by one.
+    """
     step, state = setup(cells, device)
     ways: dict[str, Callable[[], Advance]] = {"step by step": lambda: eager(step)}
     ways[f"torch.compile, {backend}"] = lambda: eager(_compiled(step, backend))
@@ -78,7 +79,7 @@ def rows(cells: Sequence[int], device: str, samples: int, backend: str) -> Itera
         row: dict[str, Any] = {"name": name, "particles": len(state), "steps": STEPS}
         try:
             yield row | _measured(make, step, state, device, samples, reference)
-        except Exception as failure:  # of a compiler that is not there, for one
+        except Exception as failure:  # Of a missing compiler, for example.
             yield row | {"failure": f"{type(failure).__name__}: {str(failure).strip().splitlines()[0]}"}
 
 

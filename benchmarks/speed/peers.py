@@ -2,7 +2,7 @@
 
 MLS-MPM with APIC transfers on a dense grid: F update, neo-Hookean stress and P2G in one kernel with atomic adds; grid
 update; G2P and advection in one kernel. Warp replays a CUDA graph on GPUs; on CPUs it runs one thread. Prints a line of
-JSON for each size. It runs in a process of its own, so that no peer can disturb another.
+JSON for each size. It runs in a separate process, so that peers do not disturb each other.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from . import work
 from .work import DT, GRAVITY, LAM, MU
 
 Program = tuple[Callable[[], None], Callable[[], None], Callable[[], tuple[np.ndarray, np.ndarray]]]
-"""One step, synchronise, and positions and velocities so far."""
+"""One step, synchronise, and present positions and velocities."""
 
 
 def warp_program(w: work.Work, device: str) -> Program:
@@ -120,7 +120,7 @@ def warp_program(w: work.Work, device: str) -> Program:
     if device != "cpu":
         moving = (x, v, C, F)
         start = [wp.clone(array) for array in moving]
-        launch()  # compiles, which a capture must not
+        launch()  # Compiles, which a capture must not.
         for array, initial in zip(moving, start, strict=True):
             wp.copy(array, initial)
         with wp.ScopedCapture(device=device) as capture:

@@ -1,4 +1,4 @@
-"""Time of what people run: example scenes, rollouts of many sizes, batches and large domains.
+"""Times of typical work: example scenes, rollouts of many sizes, batches and large domains.
 
     python -m benchmarks.speed.rollouts                    # CPU, all cores
     python -m benchmarks.speed.rollouts --device cuda      # either takes about a minute
@@ -35,28 +35,28 @@ from .step import Setup, run_peer, setup
 SCENES = {"cpu": ("demo", "batch"), "cuda": ("demo", "batch", "sand_column", "sand_drum", "spinner", "melt")}
 SIDES = {"cpu": (4, 10, 22, 46, 64), "cuda": (4, 10, 22, 46, 100, 200)}
 LARGE_SIDES = {"cpu": (100, 200), "cuda": (464,)}
-"""Taken last: what they leave of the memory of a CPU has few large pages, and others take a quarter longer then."""
+"""Measured last: the memory of a CPU has few large pages afterwards, and others then take a quarter longer."""
 BATCHES = {"cpu": ((64, 512),), "cuda": ((4096, 512), (1024, 2197))}
-"""Scenes, and particles of each."""
+"""Numbers of scenes, and of particles of each."""
 DOMAINS = {"cpu": (1, 4, 32), "cuda": (1, 8, 16)}
 """Cells along a side of the domain, in those of its cube."""
 DOMAIN_SIDE = {"cpu": 64, "cuda": 100}
-"""Of that cube."""
+"""Particles along a side of that cube."""
 LAWS: dict[str, Callable[[], mpm.Material]] = {
     "fixed corotated": lambda: mpm.FixedCorotated(mu=work.MU, lam=work.LAM),
     "quartic sand": lambda: mpm.QuarticSand(mu=work.MU, lam=work.LAM),
     "fluid": lambda: mpm.WeaklyCompressible(work.LAM),
 }
-"""Of the largest cubes beside the neo-Hookean ones."""
+"""Laws of the largest cubes beside the neo-Hookean ones."""
 LAW_SIDES = {"cpu": (64,), "cuda": (100, 200)}
 DETERMINISTIC = {"cpu": (), "cuda": (22, 46, 100)}
 """Sides of the cubes, some of SIDES, whose results are bit-identical from run to run; on a CPU all are."""
 PEER_SIDES = {"cpu": (10, 64), "cuda": (4, 22, 46, 100, 200)}
-"""Of the cubes that peers take too, some of SIDES. The batches above are theirs too."""
+"""Sides of the cubes that peers compute too, some of SIDES. The batches above are theirs too."""
 PEER_DOMAINS = {"cpu": (4,), "cuda": (8, 16)}
-"""Of DOMAINS, those of which a dense grid fits into memory."""
+"""Those of DOMAINS whose dense grid fits into memory."""
 SECONDS = 0.5
-"""Of steps in one measurement, about."""
+"""Approximate number of steps in one measurement."""
 
 
 def seconds(device: str, program: Callable[[], object]) -> float:
@@ -70,7 +70,7 @@ def seconds(device: str, program: Callable[[], object]) -> float:
 
 
 def least(device: str, program: Callable[[], object], samples: int) -> float:
-    """Of the times of so many calls [s]; of more of them, until they have taken SECONDS together, unless it is one."""
+    """Minimum of the times of n calls [s]; of more of them, until they have taken SECONDS together, unless n is one."""
     times = [seconds(device, program) for _ in range(samples)]
     while samples > 1 and sum(times) < SECONDS:
         times.append(seconds(device, program))
@@ -78,7 +78,7 @@ def least(device: str, program: Callable[[], object], samples: int) -> float:
 
 
 def per_step(s: Setup, device: str, samples: int, dt: float = work.DT, ordered: bool = True) -> dict[str, Any]:
-    """Least time of a substep of a rollout, of particles that were sorted before if they are to be `ordered`."""
+    """Minimum time of a substep of a rollout, with particles sorted before if `ordered`."""
     state = s.state.sorted(s.grid) if ordered else s.state
 
     def rolled(steps: int) -> Callable[[], object]:
@@ -92,7 +92,7 @@ def per_step(s: Setup, device: str, samples: int, dt: float = work.DT, ordered: 
 
 
 def beside_a_busy_process(s: Setup, samples: int) -> dict[str, Any]:
-    """The time of a substep while a process that does nothing else wants a core."""
+    """Time of a substep beside a busy process."""
     busy = subprocess.Popen([sys.executable, "-c", "while True: pass"])
     try:
         return per_step(s, "cpu", samples)
@@ -102,12 +102,12 @@ def beside_a_busy_process(s: Setup, samples: int) -> dict[str, Any]:
 
 
 def side_of(particles: int) -> int:
-    """Of a cube."""
+    """Times of a cube."""
     return round(particles ** (1 / 3))
 
 
 def changed(s: Setup, **options: Any) -> mpm.Step:
-    """The step of a cube with some options of its own."""
+    """Step of a cube with some options."""
     same = {"grid": s.grid, "law": s.step.law, "gravity": s.step.gravity, "walls": "sticky"}
     return mpm.Step(**same | options)
 
@@ -124,7 +124,7 @@ def batched(scenes: int, particles: int, device: str) -> Setup:
 
 
 def in_domain(side: int, times: int, device: str, deterministic: bool = False) -> Setup:
-    """The cube in a domain that is so many times as large along each axis."""
+    """The cube in a larger domain."""
     s = setup(work.make(side), device)
     grid = mpm.Grid(dx=s.grid.dx, lower=(0, 0, 0), upper=(times, times, times), deterministic=deterministic)
     return Setup(s.state, changed(s, grid=grid))
@@ -145,7 +145,7 @@ def of_two_materials(side: int, device: str) -> Setup:
 
 
 def in_no_order(side: int, device: str) -> Setup:
-    """The same, whose particles nobody has sorted."""
+    """The same with unsorted particles."""
     s = of_two_materials(side, device)
     return Setup(s.state.select(torch.randperm(len(s.state)).to(device)), s.step)
 
@@ -202,7 +202,7 @@ from torch_mpm.scene.run import run
 file, device, out = sys.argv[1:]
 run(torch_mpm.Scene.load(file).model_copy(update={"device": device}), out)
 """
-"""A program, so that what a process does at first is in the time."""
+"""A program, so that the start-up of a process is included."""
 
 
 def scenes(names: tuple[str, ...], device: str) -> Iterator[dict[str, Any]]:
@@ -223,7 +223,7 @@ def scenes(names: tuple[str, ...], device: str) -> Iterator[dict[str, Any]]:
 
 
 def of_peers(device: str, rollouts: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
-    """Their least times of a step, and how many times as fast a rollout of the same work is."""
+    """Minimum times of a step, and speed-up by a rollout of the same work."""
     ours = {(r["name"], r["particles"]): r["us"] for r in rollouts}
     programs = [("one scene", PEER_SIDES[device], [])]
     for scenes, particles in BATCHES[device]:
@@ -240,7 +240,8 @@ def of_peers(device: str, rollouts: list[dict[str, Any]]) -> Iterator[dict[str, 
 
 def plain_programs(device: str, scenes: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
     """A step of Warp launched from Python, three kernels for the neo-Hookean cube with about as many particles as a
-    scene has, and how many times as fast the scene is as run, with its laws, obstacles, heat and output."""
+    scene, and the speed-up by the complete scene, with its laws, obstacles, heat and output.
+    """
     if device != "cuda" or not peers.is_installed("warp"):
         return
     sides = [side_of(scene["particles"]) for scene in scenes]
@@ -300,7 +301,7 @@ def row_of_peer(r: dict[str, Any]) -> tuple[Any, ...]:
 
 
 def row_beside(r: dict[str, Any]) -> tuple[Any, ...]:
-    """Of Warp's step beside a scene."""
+    """Comparison of Warp's step with a scene."""
     return r["name"], r["particles"], r["us"], r["times"]
 
 

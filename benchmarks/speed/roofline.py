@@ -1,4 +1,4 @@
-"""Figure of the bytes that each part of a step moves in a second beside what the memory moves."""
+"""Figure of the bytes per second of each part of a step, compared with the bandwidth of the memory."""
 
 from __future__ import annotations
 

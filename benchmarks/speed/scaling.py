@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 RATES = {1e7: "10 M/s", 1e8: "100 M/s", 1e9: "1 G/s", 1e10: "10 G/s"}
-"""Particles per second, of which a line each is drawn."""
+"""Particles per second that are drawn as lines."""
 
 
 def plot(results: Sequence[dict[str, Any]], path: Path) -> None:

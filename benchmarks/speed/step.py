@@ -4,9 +4,9 @@
     python -m benchmarks.speed.step --device cuda          # 1 and 8 million particles; about 2 minutes
     python -m benchmarks.speed.step --device cuda --out DIRECTORY
 
-It needs no network. Warp and Taichi take part where they are installed (`pip install torch-mpm[bench]`), or not with
-`--peers` and no name. Where there is no git, the environment variable TORCH_MPM_COMMIT names the commit. A part that
-fails is reported at the end and does not stop the others.
+It needs no network. Warp and Taichi are included where they are installed (`pip install torch-mpm[bench]`), unless
+`--peers` has no name. Without git, the environment variable TORCH_MPM_COMMIT names the commit. A failed part is
+reported at the end and does not stop the others.
 
 Work: `benchmarks/speed/work.py`. Whole steps: wall clock of several steps in a row from particles in the order of their
 cells, synchronised once, everything included: activation, stress, P2G, grid update, G2P, positions and F. On CUDA they
@@ -76,7 +76,7 @@ def setup(w: work.Work, device: str, dtype: torch.dtype = torch.float32) -> Setu
 
 
 def whole_steps(clock: Clock, s: Setup) -> Iterator[tuple[str, Time]]:
-    """Steps in a row, each from the state that the one before left; and a step with its backward pass."""
+    """Consecutive steps, and a step with its backward pass."""
 
     def forward(steps: int) -> mpm.State:
         state = s.state
@@ -108,7 +108,7 @@ def whole_steps(clock: Clock, s: Setup) -> Iterator[tuple[str, Time]]:
 
 
 def roll(s: Setup, start: mpm.State) -> None:
-    """STEPS steps that leave their result in `start`, as a graph to be replayed needs it."""
+    """STEPS steps whose result is stored in `start`, as required for the replay of a graph."""
     state = start
     for _ in range(STEPS):
         state = s.step(state, work.DT)
@@ -121,18 +121,18 @@ def roll(s: Setup, start: mpm.State) -> None:
 
 @dataclasses.dataclass
 class Op:
-    """A part of the step: a function of tensors, and an example of them."""
+    """A part of the step: a function of tensors, and example arguments."""
 
     name: str
     function: Callable[..., Any]
     inputs: tuple[Tensor, ...]
     differentiable: bool = True
     unread: tuple[int, ...] = ()
-    """Inputs, by their place, whose values the backward pass does not need."""
+    """Inputs, by index, whose values the backward pass does not need."""
 
 
 def parts(s: Setup) -> tuple[mpm.Blocks, list[Op]]:
-    """The ops of a step in their order, on the blocks of a state that has moved for a while."""
+    """Ops of a step in their order, on the blocks of a state after some motion."""
     grid, law = s.grid, s.step.law
     with torch.no_grad():
         state = mpm.rollout(s.step, s.state, STEPS, work.DT)
@@ -190,7 +190,7 @@ def time_part(clock: Clock, op: Op, blocks: mpm.Blocks, active: int) -> Iterator
 
     read = [leaf for i, leaf in enumerate(leaves) if i not in op.unread]
     given = {g.data_ptr() for g in grads}
-    made = [g for g in backward() if g.data_ptr() not in given]  # others are passed on as they are
+    made = [g for g in backward() if g.data_ptr() not in given]  # Others are unchanged.
     yield entry(f"{op.name}, backward", clock.op(backward), *read, *grads, *made)
 
 
@@ -243,7 +243,7 @@ def _random_lattice(shape: Sequence[int], generator: torch.Generator, like: Tens
     return (2 * torch.rand(*shape, generator=generator) - 1).to(like)
 
 
-# ---- peers, each in a process of its own
+# ---- peers, each in a separate process
 
 
 def run_peer(
@@ -260,7 +260,7 @@ def run_peer(
 
 
 def difference(state: mpm.State, saved: Path) -> dict[str, float]:
-    """Largest difference of positions [m] and velocities [m/s] from those of a peer after as many steps."""
+    """Largest difference of positions [m] and velocities [m/s] from those of a peer after the same number of steps."""
     with np.load(saved) as other:
         return {k: float(np.abs(getattr(state, k).detach().cpu().numpy() - other[k]).max()) for k in ("x", "v")}
 
@@ -269,7 +269,7 @@ def difference(state: mpm.State, saved: Path) -> dict[str, float]:
 
 
 class Report:
-    """What was measured so far, and what failed."""
+    """Results so far, and failures."""
 
     def __init__(self, device: str) -> None:
         self.result: dict[str, Any] = {
@@ -323,7 +323,7 @@ def measure_host(report: Report, clock: Clock) -> None:
 
 
 def measure_peer(report: Report, peer: str, device: str, sides: Sequence[int], samples: int) -> None:
-    """The peer's times of all sizes, and how far its particles are from ours."""
+    """Times of a peer for all sizes, and the distance of its particles from ours."""
     if not peers.is_installed(peer):
         print(f"{peer} is not installed")
         return

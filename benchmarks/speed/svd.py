@@ -1,7 +1,7 @@
 """Times of singular values and the return map of sand: `python -m benchmarks.speed.svd [--device cuda]`.
 
-float32, 3-D, deformations I + 0.1 G. Beside torch.linalg.svd and, where it is installed, Warp, on the same matrices in
-the same run. Errors: benchmarks/accuracy/svd.py.
+float32, 3-D, deformations I + 0.1 G. Compared with torch.linalg.svd and, where it is installed, Warp, on the same
+matrices in the same run. Errors: benchmarks/accuracy/svd.py.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from .timing import Clock
 
 SIZES = {"cpu": 100_000, "cuda": 1_000_000}
 MOST_SLOW = {"cpu": 100_000, "cuda": 100_000}
-"""Matrices given to torch.linalg.svd, which takes 0.2 s for a million on a GPU."""
+"""Number of matrices for torch.linalg.svd, which takes 0.2 s for a million on a GPU."""
 
 
 FORMS = (
@@ -44,7 +44,9 @@ def structure_of_arrays(F: Tensor) -> Tensor:
 
 
 def warp_arrays(F: Tensor) -> tuple[Callable[[], object], Callable[[], tuple[Tensor, Tensor, Tensor]]] | None:
-    """A call of Warp's svd3 on all matrices (on CPUs in one thread) and what reads U, σ, V; or None without Warp."""
+    """A call of Warp's svd3 on all matrices (on CPUs in one thread) and a function that returns U, σ, V; or None
+    without Warp.
+    """
     try:
         import warp as wp
     except ImportError:

@@ -14,7 +14,7 @@ Run = Callable[[], object]
 
 @dataclasses.dataclass(frozen=True)
 class Time:
-    """Median and least of several measurements [ms]; whether of a CUDA graph, in which the host does not count."""
+    """Median and minimum of several measurements [ms]; whether of a CUDA graph, which excludes the host."""
 
     ms: float
     fastest_ms: float
@@ -22,7 +22,7 @@ class Time:
 
 
 class Clock:
-    """Measures on one device.
+    """Clock of one device.
 
     On CUDA everything runs on one stream, that of this clock: use `with clock:` around the set-up too, because autograd
     runs a backward pass on the stream of its forward pass and a graph can capture one stream only.
@@ -114,19 +114,19 @@ def _wall(run: Run) -> float:
 
 
 def memory_ms(clock: Clock, size: int) -> float:
-    """Least time in which the memory moves `size` bytes: a copy, which writes half of them, or a read [ms]."""
+    """Minimum time in which the memory moves `size` bytes: a copy, which writes half of them, or a read [ms]."""
     return min(copy_ms(clock, size), read_ms(clock, size))
 
 
 def copy_ms(clock: Clock, size: int) -> float:
-    """Least time of a copy that reads and writes `size` bytes together [ms]."""
+    """Minimum time of a copy that reads and writes `size` bytes together [ms]."""
     source = torch.ones(size // 8, device=clock.device)
     target = torch.ones_like(source)
-    # A kernel as the parts are: of `copy_` a CUDA graph makes a transfer by the driver.
+    # A kernel, as the parts are: a CUDA graph converts `copy_` to a transfer by the driver.
     return clock.op(lambda: torch.neg(source, out=target)).fastest_ms
 
 
 def read_ms(clock: Clock, size: int) -> float:
-    """Least time of a sum over `size` bytes [ms]."""
+    """Minimum time of a sum over `size` bytes [ms]."""
     values = torch.ones(size // 4, device=clock.device)
     return clock.op(values.sum).fastest_ms

@@ -4,8 +4,8 @@
     python -m benchmarks.speed.training --quick              # seconds
 
 Rollouts: the neo-Hookean cube of `benchmarks/speed/work.py`, float32, one call of `torch_mpm.rollout` without
-gradients, and with the gradient of its end by the velocities at its start. The op of many steps takes them again in the
-backward pass, some at a time, unless the forward pass has kept everything.
+gradients, and with the gradient of its end by the velocities at its start. The op of many steps recomputes them in the
+backward pass, some at a time, unless the forward pass has stored everything.
 
 Peers: the same cube with a fixed corotated law, in a rollout, in a script of another project whose import names
 `torch_mpm.compat`, and by that project's algorithm: that of MPM-PyTorch in plain torch
@@ -15,8 +15,8 @@ Peers: the same cube with a fixed corotated law, in a rollout, in a script of an
 
 Networks: a network is the law of a step; some steps in a row, one by one, compiled, and as one CUDA graph.
 
-Memory is the peak above that before both passes, or the forward pass where there is no other: on CUDA that of PyTorch's
-allocator, on the CPU resident memory, in a process for each case.
+Memory is the peak above that before both passes, or before a forward pass alone: on CUDA that of PyTorch's allocator,
+on the CPU resident memory, in a process for each case.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ EVERYTHING = mpm.Checkpoints(memory=1e11)
 NETWORKS = ((8, 8, 4), (16, 16, 16))
 """Cells along the edges of the block, of 8 particles each."""
 AGREEMENT = {torch.float32: 1e-4, torch.float64: 1e-7}
-"""Of velocities after 20 steps, relative; scripts have the logarithm of E in float32."""
+"""Relative tolerance of velocities after 20 steps; scripts store the logarithm of E in float32."""
 
 Forward = Callable[[Tensor], tuple[Tensor, Tensor]]
 """Velocities at the start -> positions and velocities at the end."""
@@ -60,7 +60,7 @@ Forward = Callable[[Tensor], tuple[Tensor, Tensor]]
 
 
 def with_room(s: Setup, law: mpm.Material, **options: Any) -> Setup:
-    """The work with another law, on a grid whose pool has room for all steps, so that a call takes any number."""
+    """The work with another law, on a grid with a pool for all steps, so that a call computes any number of them."""
     wanted = s.grid.activate(s.state.x).wanted
     grid = mpm.Grid(s.grid.dx, s.grid.lower, s.grid.upper, max_blocks=2 * wanted)
     step = mpm.Step(grid, law, gravity=s.step.gravity, **options)
@@ -72,7 +72,7 @@ def elastic(w: work.Work, device: str) -> Setup:
 
 
 def corotated(project: Project, w: work.Work, device: str, dtype: torch.dtype = torch.float32) -> Setup:
-    """The work of a project."""
+    """Work of a project."""
     law = mpm.FixedCorotated(mu=work.MU, lam=work.LAM)
     return with_room(setup(w, device, dtype), law, stress_form=project.stress_form)
 
@@ -111,7 +111,7 @@ def disagreement(project: Project, w: work.Work, device: str, n: int) -> dict[st
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """A rollout of the neo-Hookean cube, or a program that does the work of a project; what it keeps of its steps."""
+    """A rollout of the neo-Hookean cube, or a program that does the work of a project; and its stored steps."""
 
     name: str
     kept: str
@@ -121,7 +121,7 @@ class Case:
     project: str | None = None
 
     def program(self, device: str) -> tuple[Forward, Tensor]:
-        """The forward pass, and velocities to begin with."""
+        """Forward pass, and initial velocities."""
         w = work.make(self.side)
         s = elastic(w, device) if self.project is None else corotated(PROJECTS[self.project], w, device)
         scripts = {} if self.project is None else PROJECTS[self.project].scripts()
@@ -162,8 +162,9 @@ def alone(forward: Forward, v: Tensor) -> None:
 
 
 def measured(case: Case, device: str, samples: int, with_memory: bool = True) -> dict[str, Any]:
-    """Least times [s] of a forward pass without gradients and of both passes, and the memory [bytes]; None for what a
-    project does not have, and what does not fit into the memory of the device."""
+    """Minimum times [s] of a forward pass without gradients and of both passes, and the memory [bytes]; None for passes
+    that a project lacks or that exceed the memory of the device.
+    """
     about = {"project": case.project, "name": case.name, "kept": case.kept}
     row: dict[str, Any] = {**about, "particles": case.side**3, "steps": case.steps}
     row |= {"forward": None, "both": None, "memory": None, "fits": True}
@@ -178,12 +179,12 @@ def measured(case: Case, device: str, samples: int, with_memory: bool = True) ->
     except torch.OutOfMemoryError as error:
         print(str(error).splitlines()[0])
         row["fits"] = False
-    gc.collect()  # of the graph that an error has left
+    gc.collect()  # Of the graph of a failed pass.
     return row
 
 
 def resident(case: Case) -> int | None:
-    """Resident memory of a case on the CPU in a process of its own, where allocators keep nothing of others."""
+    """Resident memory of a case on the CPU in a separate process, where allocators retain nothing of others."""
     if not memory.Resident.available:
         return None
     with concurrent.futures.ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
@@ -192,7 +193,7 @@ def resident(case: Case) -> int | None:
 
 def _resident(case: Case) -> int:
     common.use_all_cores()
-    case.work()(*dataclasses.replace(case, side=4, steps=1).program("cpu"))  # first calls import what they need
+    case.work()(*dataclasses.replace(case, side=4, steps=1).program("cpu"))  # First calls import modules.
     program = case.program("cpu")
     return memory.Resident().peak(lambda: case.work()(*program))
 
@@ -250,7 +251,7 @@ BESIDE = (
 
 
 def rows_of_peers(result: dict[str, Any]) -> Iterator[tuple[Any, ...]]:
-    """Those of a result, with multiples, for each step, of the times and the memory of the rollout of the same work."""
+    """Rows of a result with the ratios of times and memory per step to those of the rollout of the same work."""
     for r in result["peers"]:
         own = next(o for o in result["peers"] if (o["project"], o["name"]) == (r["project"], "rollout"))
         cells: list[Any] = [r["project"], r["name"], r["kept"], r["particles"], r["steps"]]
@@ -267,7 +268,7 @@ def _times(value: float | None, base: float | None) -> str | None:
 
 
 def agreement(result: dict[str, Any]) -> str:
-    """How far programs are from the rollout."""
+    """Differences of the programs from the rollout."""
     return "; ".join(f"{key} {max(found.values()):.1e}" for key, found in result["disagreement"].items())
 
 

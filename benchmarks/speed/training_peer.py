@@ -1,9 +1,9 @@
-"""A step of MPM as scripts in plain torch take it, differentiated by autograd alone.
+"""A step of MPM in plain torch, as in scripts, differentiated by autograd only.
 
 The algorithm is that of MPM-PyTorch (Lin et al. 2025): weights, gradients of weights and arms of all 27 nodes of a
-particle are tensors, `index_add` scatters onto a dense grid, forces are by the gradient of quadratic B-splines, F moves
-by ∇v, positions and entries of F are clamped, and fixed corotated stress comes from a decomposition. That one is the
-library's, in place of Warp's there, so that it costs the peer next to nothing.
+particle are tensors, `index_add` scatters onto a dense grid, forces are by the gradient of quadratic B-splines, F is
+updated by ∇v, positions and entries of F are clamped, and fixed corotated stress comes from a decomposition. The
+decomposition is that of this library instead of Warp's, so that it costs the peer almost nothing.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Particles = tuple[Tensor, Tensor, Tensor, Tensor]
 """x, v [P, 3], C and F [P, 3, 3]."""
 
 CLIP, LARGEST_ENTRY = 0.5, 2.0
-"""Cells that positions keep from the faces, and what entries of F are clamped to."""
+"""Minimum distance of positions from the faces in cells, and bound of the entries of F."""
 
 
 def corotated(F: Tensor, mu: float, lam: float) -> Tensor:
@@ -75,5 +75,5 @@ class DenseSolver:
 
 
 def _products(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
-    """Of values [P, axis, node] along the three axes, for all 27 nodes [P, 27]."""
+    """Products of values [P, axis, node] along the three axes, for all 27 nodes [P, 27]."""
     return torch.einsum("pi,pj,pk->pijk", a[:, 0], b[:, 1], c[:, 2]).flatten(1)

@@ -1,8 +1,8 @@
-"""A step of MPM by kernels of Warp inside an autograd Function, as simulators of networks in Warp take it.
+"""A step of MPM by kernels of Warp inside an autograd Function, as in simulators for networks.
 
 The algorithm is that of NCLaw (Ma et al. 2023): the stress is given, transfers are MLS-MPM with APIC on a dense grid by
-atomic adds, F moves by C, and the backward pass runs the kernels again, on a tape. Arrays are tensors of torch, whose
-allocator so tells the memory.
+atomic adds, F is updated by C, and the backward pass reruns the kernels, on a tape. Arrays are tensors of torch, so
+that its allocator measures the memory.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ class WarpSolver:
         return results
 
     def launch(self, inputs: Sequence[Any], outputs: Sequence[Any]) -> None:
-        """The kernels, with nodes of their own; arrays of Warp."""
+        """Kernels, with separate nodes; arrays of Warp."""
         import warp as wp
 
         p2g, update, g2p = kernels()
@@ -120,7 +120,7 @@ class WarpSolver:
 
 
 def _array(t: Tensor, kind: Any, recorded: bool) -> Any:
-    """A tensor as an array of Warp, with a gradient of torch's too where it is recorded."""
+    """A tensor as an array of Warp, with a gradient of torch where it is recorded."""
     import warp as wp
 
     grad = wp.from_torch(torch.zeros_like(t), dtype=kind) if recorded else None
@@ -135,7 +135,7 @@ def arrays(tensors: Sequence[Tensor], recorded: bool) -> list[Any]:
 
 
 def stream_of(like: Tensor) -> contextlib.AbstractContextManager[Any]:
-    """Where Warp works on the stream of torch."""
+    """Context in which Warp works on the stream of torch."""
     import warp as wp
 
     if not like.is_cuda:

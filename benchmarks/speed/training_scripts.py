@@ -1,4 +1,4 @@
-"""Scripts that call a simulator, as users of other projects write them. A part of `training`."""
+"""Scripts that call a simulator, as users of other projects write them. Part of `training`."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ E, NU = work.MU * (3 * work.LAM + 2 * work.MU) / (work.LAM + work.MU), work.LAM 
 Take = Callable[..., tuple[Tensor, ...]]
 """x, v, C and F a step later."""
 Run = Callable[[Particles, int, bool], Particles]
-"""x, v, C and F some steps later; whether torch's checkpoints are around each of them."""
+"""x, v, C and F n steps later; whether torch's checkpoints surround each of them."""
 Make = Callable[[work.Work, Tensor], Run]
-"""Of the work and its positions."""
+"""Function of the work and its positions."""
 
 
 def stepwise(take: Take) -> Run:
@@ -110,7 +110,7 @@ def physgaussian_there(w: work.Work, x: Tensor) -> Run:
 
 
 def has_warp() -> bool:
-    """Whether Warp is there, in a version whose `svd3` returns its results."""
+    """Whether Warp is available in a version whose `svd3` returns its results."""
     try:
         version = importlib.metadata.version("warp-lang")
     except importlib.metadata.PackageNotFoundError:
@@ -120,17 +120,17 @@ def has_warp() -> bool:
 
 @dataclasses.dataclass(frozen=True)
 class Project:
-    """What people come from: the form of its forces, its script here, and its algorithm."""
+    """A project of users: the form of its forces, its script for torch_mpm, and its algorithm."""
 
     stress_form: str
     here: Make
     there: Make
     precision: torch.dtype
-    """The best that its algorithm has."""
+    """Fastest version of its algorithm."""
     checkpoints: bool
-    """Whether its users put checkpoints of torch around every step."""
+    """Whether its users surround every step with checkpoints of torch."""
     gradients: bool = True
-    """Whether its algorithm has them."""
+    """Whether its algorithm has checkpoints."""
     with_warp: bool = False
     """Whether its algorithm runs on Warp."""
 

@@ -1,8 +1,8 @@
 """Times of the CUDA transfer kernels: `python benchmarks/speed/transfer_kernels.py --sizes 100 200 --kernel quadratic`.
 
-Each op is captured in a CUDA graph, so that the host does not count, and replayed; the median counts. Particles lie
-8 per cell, float32, 3-D, in the memory order named: `lattice` and `random` positions in order of block and cell,
-`drift` after a random motion of up to 0.3 cells, `shuffled` in no order at all.
+Each op is captured in a CUDA graph, so that the host is excluded, and replayed; the median is reported. Particles lie 8
+per cell, float32, 3-D, in the memory order named: `lattice` and `random` positions in order of block and cell, `drift`
+after a random motion of up to 0.3 cells, `shuffled` in no order at all.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The work that every program of the comparison does: a dense cube of neo-Hookean particles, quadratic kernel, float32.
+"""Common work of all programs of the comparison: a dense cube of neo-Hookean particles, quadratic kernel, float32.
 
 side³ particles, 8 per cell with jitter, in a domain of the unit cube with n³ cells, sorted by block of 4³ nodes and by
 cell. A smooth velocity field moves them, gravity pulls them, walls are far away. Needs numpy alone.
@@ -21,7 +21,8 @@ MARGIN = 8
 @dataclasses.dataclass(frozen=True)
 class Work:
     """Positions x and velocities v [P, 3] [m, m/s], n cells along a unit cube, mass [kg] and volume [m³] of one
-    particle, and how many unit cubes the domain is along each axis."""
+    particle, and the size of the domain in unit cubes along each axis.
+    """
 
     n: int
     x: np.ndarray
@@ -43,11 +44,11 @@ class Work:
         return self.n * a, self.n * b, self.n * c
 
     def in_domain(self, times: int) -> Work:
-        """In a domain that is so many times as large along each axis."""
+        """The work in a larger domain, by a factor along each axis."""
         return dataclasses.replace(self, cubes=(times, times, times))
 
     def side_by_side(self, scenes: int) -> Work:
-        """As many of these cubes, a power of two, in one domain: what a program without batches makes of scenes."""
+        """A number of these cubes, a power of two, in one domain: the form of scenes in a program without batches."""
         cubes = [1, 1, 1]
         while np.prod(cubes) < scenes:
             cubes[int(np.argmin(cubes))] *= 2
@@ -58,7 +59,7 @@ class Work:
 
 
 def cells_of(side: int) -> int:
-    """Along the unit cube."""
+    """Number of cells along the unit cube."""
     return side // 2 + 2 * MARGIN
 
 

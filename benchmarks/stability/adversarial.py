@@ -1,9 +1,9 @@
-"""Random rollouts that try to turn particles inside out: `python -m benchmarks.stability.adversarial`.
+"""Random rollouts that try to invert particles: `python -m benchmarks.stability.adversarial`.
 
-Each rollout is made from its number: a motion (impacts, collisions, crushing between plates, spinning, stretching,
+Each rollout is determined by its number: a motion (impacts, collisions, crushing between plates, spinning, stretching,
 sprays, sheets, density jumps, an obstacle that moves through, prestress), a law of any stiffness, and dimension,
-kernel, transfer, stress form, walls, density and length. It takes dt = `step.stable_dt(state, cfl)` anew at every
-step. Speeds are up to three times √(E/ρ). The exit status says whether all was well at cfl = 1.
+kernel, transfer, stress form, walls, density and length. dt = `step.stable_dt(state, cfl)` is recomputed at every step.
+Speeds are up to three times √(E/ρ). The exit status is zero if there was no failure at cfl = 1.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from .stable_dt import LAWS as SOLIDS
 STEPS = 200
 CFL = (1.0, 0.5)
 GAIN = 1.1
-"""Largest energy of a closed system over its first one that counts as kept."""
+"""Largest ratio of the energy of a closed system to its first one that counts as conserved."""
 
 DESCRIBED = ("number", "motion", "law", "dim", "kernel", "transfer", "flip", "stress_form", "mach")
 """Fields of a case in a result; its number determines the others."""
@@ -105,7 +105,7 @@ class Case:
 
 @dataclasses.dataclass
 class Problem:
-    """What a rollout starts from."""
+    """Initial data of a rollout."""
 
     step: mpm.Step
     state: mpm.State
@@ -117,7 +117,7 @@ CELLS = {2: 16, 3: 9}
 
 
 def problem(case: Case) -> Problem:
-    """The scene of a case. Everything random comes from its number."""
+    """The scene of a case. All random numbers depend on its number."""
     torch.manual_seed(case.number)
     cells, dx, dim = CELLS[case.dim], case.dx, case.dim
     law = LAWS[case.law](case.E, case.nu)
@@ -154,7 +154,7 @@ def body(case: Case, cells: int) -> tuple[Tensor, Tensor]:
 
 
 def velocity(case: Case, x: Tensor) -> Tensor:
-    """In the unit of speed, at places [P, D] in cells."""
+    """Velocities in the unit of speed, at positions [P, D] in cells."""
     direction = torch.nn.functional.normalize(torch.randn(1, case.dim, dtype=x.dtype))
     from_middle = x - x.mean(0)
     if case.motion == "spray":
@@ -210,7 +210,7 @@ def energy(step: mpm.Step, state: mpm.State, dt: float) -> float:
 
 
 def flattened(state: mpm.State) -> Tensor:
-    """Particles with a stretch below the rounding error of the largest one, whose sign means nothing, bool [P]."""
+    """Particles with a stretch below the rounding error of the largest one, whose sign has no meaning, bool [P]."""
     if state.F is None:
         return torch.zeros_like(state.mass, dtype=torch.bool)
     stretches = torch.linalg.svdvals(state.F)
@@ -219,7 +219,9 @@ def flattened(state: mpm.State) -> Tensor:
 
 @torch.no_grad()
 def run(case: Case, cfl: float, steps: int = STEPS) -> dict[str, Any]:
-    """How many particles went wrong and at which step, where it ended; the largest energy over the first."""
+    """Number of failed particles and step of the failure, where the rollout ended; the largest energy over the
+    first.
+    """
     p = problem(case)
     step, state = p.step, p.step.prepare(p.state)
     row: dict[str, Any] = {"inverted": 0, "flattened": 0, "not finite": 0, "step": None}
@@ -243,7 +245,7 @@ def run(case: Case, cfl: float, steps: int = STEPS) -> dict[str, Any]:
 
 
 def rises(row: dict[str, Any]) -> bool:
-    """Whether a closed system gained energy; FLIP's noise does not count as one."""
+    """Whether a closed system gained energy; noise of FLIP is not counted."""
     return row["closed"] and row["gain"] > GAIN and row["transfer"] != "flip" and row["flip"] == 0
 
 

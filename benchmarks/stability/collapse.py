@@ -2,7 +2,7 @@
 
 Columns of one size with E from 1e3 Pa (half crushed by its own weight) to 1e9 Pa and friction angles from 0° to 60°
 collapse as one batch of scenes, each with half of its own stability limit (`Step.stable_dt`) as its time step,
-estimated at every step. A column starts without strain, so it falls on itself first. The exit status says whether all
+estimated at every step. A column starts without strain, so it falls on itself first. The exit status is zero if all
 states stayed finite and no scene gained energy.
 """
 
@@ -78,7 +78,7 @@ def measure(dim: int, energy: str, apex: str, steps: int, device: str) -> list[d
 
 
 def text(result: dict[str, Any]) -> str:
-    """Tables of a result in Markdown: for each law the worst of all stiffnesses and angles, then everything."""
+    """Tables of a result in Markdown: for each law the worst of all stiffnesses and angles, then all cases."""
     header = ("law", "columns", "steps", "all finite", "largest rise of energy", "least time / √(H/g)", "seconds")
     groups: dict[str, list[dict[str, Any]]] = {}
     for row in result["rows"]:

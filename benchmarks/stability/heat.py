@@ -2,9 +2,9 @@
 
 A square of 64 × 64 cells with four jittered particles each, random temperatures, half of it conducting better by the
 contrast; the diffusion number r = dt κ/(ρ c dx²) is that of the better half. Iterations, and the mass-weighted RMS
-error relative to the RMS increment against a direct sparse solve in float64 (scipy); residuals are in the .json.
-Solves end where the residual is 1e-10 (float64) or 1e-6 (float32) of the first one; those that are refined, in float32
-with residuals in float64, at 1e-10 K.
+error relative to the RMS increment against a direct sparse solve in float64 (scipy); residuals are in the .json. Solves
+end where the residual is 1e-10 (float64) or 1e-6 (float32) of the first one; refined ones, in float32 with residuals in
+float64, at 1e-10 K.
 """
 
 from __future__ import annotations

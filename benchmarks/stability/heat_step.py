@@ -1,9 +1,9 @@
 """One whole heat step as a linear map of the particles: `python -m benchmarks.stability.heat_step [--quick] [--out F]`.
 
-Transfer to the nodes, solve, transfer back, of every unit vector of temperatures θ_p and gradients g_p, each in a scene
-of its own. The spectral radius ρ of this map must not exceed 1, nor must its norm with the energy
-Σ_p m_p C_p (θ_p² + D |g_p|²), which bounds all of its powers. Nodes are solved by a singular value decomposition, exact
-to rounding for any contrast, so that what shows is the method; a test compares it with the library's solve.
+Transfer to the nodes, solve, transfer back, for every unit vector of temperatures θ_p and gradients g_p, each in a
+separate scene. The spectral radius ρ of this map must not exceed 1, nor must its norm with the energy Σ_p m_p C_p (θ_p²
++ D |g_p|²), which bounds all of its powers. Nodes are solved by a singular value decomposition, exact to rounding for
+any contrast, so that only the method matters; a test compares it with the library's solve.
 
 Particles on a lattice, random or Poisson-disc, 1 to 16 per cell, in 3 × 3 cells (2 × 2 for 16 per cell, 2 × 2 × 2 in
 3-D). κ or ρ C jumps by the contrast, at a plane through the middle or from particle to particle at random;
@@ -38,13 +38,13 @@ BODIES = (
     *itertools.product((3,), ("quadratic", "cubic"), ("lattice", "random", "poisson"), (1, 8)),
 )
 BODY = ("dim", "kernel", "layout", "per_cell")
-"""What a body is, as fields of a case."""
+"""Fields of a case that define a body."""
 VARIANTS = tuple(itertools.product(("conductivity", "capacity"), ("plane", "random"), BOUNDARIES))
-"""What jumps, where, and the boundary."""
+"""Jumping parameter, place of the jump, and boundary."""
 LARGE_CONTRASTS = (1e2, 1e8)
-"""Those of the largest bodies, which take a second each."""
+"""Contrasts of the largest bodies, which take a second each."""
 LIMIT = 1e-12
-"""What ρ may exceed 1 by, in rounding."""
+"""Rounding error allowed for ρ above 1."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,8 +66,8 @@ class Case:
 class Exact(mpm.Heat):
     """Heat in scenes that differ in their temperatures only, nodes solved to rounding.
 
-    With W Wᵀ = dt M^(−1/2) (H + X) M^(−1/2) and W = U σ Vᵀ, the increment is −M^(−1/2) U σ²/(1 + σ²) Uᵀ M^(1/2) θ:
-    no step away from θ is longer than θ, however W is rounded.
+    With W Wᵀ = dt M^(−1/2) (H + X) M^(−1/2) and W = U σ Vᵀ, the increment is −M^(−1/2) U σ²/(1 + σ²) Uᵀ M^(1/2) θ: no
+    step away from θ is longer than θ, for any rounding of W.
     """
 
     def _solve(self, nodes: HeatNodes, dt: float | Tensor) -> Tensor:
@@ -102,7 +102,7 @@ class Exact(mpm.Heat):
 
 
 def positions(case: Case, dx: float) -> tuple[Tensor, int]:
-    """Particles [P, D] of a body that fits no lattice, and its cells along an axis."""
+    """Particles [P, D] of a body that is not aligned with the lattice, and its cells along an axis."""
     cells = 3 if case.dim == 2 and case.per_cell < 16 else 2
     lower, upper = (0.0,) * case.dim, (cells * dx,) * case.dim
     if case.layout == "random":
@@ -158,14 +158,14 @@ def matrix(case: Case, kind: Callable[..., mpm.Heat] = Exact) -> Tensor:
 
 
 def measure(case: Case) -> dict[str, Any]:
-    """Spectral radius and norm of a step, both less 1."""
+    """Spectral radius and norm of a step, both minus 1."""
     A = matrix(case)
     radius = torch.linalg.eigvals(A).abs().max()
     return {**dataclasses.asdict(case), "radius": float(radius) - 1, "norm": float(torch.linalg.matrix_norm(A, 2)) - 1}
 
 
 def cases(quick: bool) -> Iterator[Case]:
-    """All of the table, or those of one body."""
+    """All cases of the table, or those of one body."""
     bodies = ((2, "quadratic", "random", 4),) if quick else BODIES
     for turn, (body, transfer) in enumerate(itertools.product(bodies, TRANSFERS)):
         large = body[0] == 3 and body[3] == 8
@@ -191,13 +191,13 @@ def summary(rows: Iterable[dict[str, Any]]) -> dict[str, Any]:
 
 
 def largest(rows: Iterable[dict[str, Any]]) -> str:
-    """The largest excess of some cases; what is no more than rounding as that."""
+    """Largest excess of some cases; values within rounding as a bound."""
     worst = max(excess(row) for row in rows)
     return f"< {LIMIT:g}" if worst < LIMIT else f"{worst:.1e}"
 
 
 def table(result: dict[str, Any]) -> str:
-    """What ρ and norm exceed 1 by at most, by transfer and diffusion number."""
+    """Largest excess of ρ and norm over 1, by transfer and diffusion number."""
     rows = result["rows"]
     cells = [
         [name, *(largest(r for r in rows if r["transfer"] == name and r["number"] == number) for number in NUMBERS)]

@@ -1,8 +1,8 @@
 """Largest stable time step of every law: `python -m benchmarks.stability.law_dt [--device cuda]`.
 
 As benchmarks.stability.stable_dt, in one setting (APIC, MLS, quadratic kernel, 2 particles per axis of a cell). A law
-with a return map takes the uniform deformation to its yield surface in the first step, which keeps it uniform; the
-estimate is that of the state before.
+with a return map moves the uniform deformation to its yield surface in the first step, which preserves uniformity; the
+estimate is that of the previous state.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from .. import common
 from .stable_dt import LAWS, Case, measure, ratio
 
 VARIED = ("law", "dim", "E", "nu", "stretch")
-"""Fields of a case that differ."""
+"""Fields that differ between cases."""
 
 
 def all_cases(quick: bool) -> list[Case]:
@@ -94,7 +94,7 @@ def cell(cases: list[dict[str, Any]]) -> str:
 
 
 def spread(cases: list[dict[str, Any]]) -> float:
-    """The largest difference between the multiples of cases that differ in E alone."""
+    """Largest difference between the multiples of cases that differ only in E."""
     groups: dict[tuple[Any, ...], list[float]] = {}
     for c in cases:
         groups.setdefault((c["law"], c["dim"], c["nu"], c["stretch"]), []).append(c["stable"])

@@ -2,9 +2,9 @@
 
 Deformations next to the identity, of any size and shape from 1e-10 to 1e10, with stretches up to e²⁰, and nearly
 spherical; friction angles 0° to 89°, ν from 0 to 0.4999, μ from 1 to 1e8 Pa. Counts results that are not finite, roots
-that were not found, and states of clearly positive determinant that were called invalid; the exit status says whether
-all are zero. Roots that were not found on steep cones of the unilateral energy (3-D, φ above asin(3/5) = 36.87°), where
-some directions have none, are counted by themselves and are no failure: the op reports them.
+that were not found, and states of clearly positive determinant that were reported as invalid; the exit status is zero
+if all counts are. Roots that were not found on steep cones of the unilateral energy (3-D, φ above asin(3/5) = 36.87°),
+where some directions have none, are counted separately and are not failures: the op reports them.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ DTYPES = (torch.float32, torch.float64)
 COUNTS = ("not finite", "not converged", "wrongly invalid", "gradient not finite")
 STEEP = "not converged, steep cone"
 STEEP_ANGLE = math.asin(3 / 5)
-"""Friction angle above which the unilateral energy leaves some directions without a root."""
+"""Friction angle above which some directions have no root with the unilateral energy."""
 
 
 def deformations(kind: int, dim: int, generator: torch.Generator) -> Tensor:

@@ -1,9 +1,9 @@
 """Largest stable time step against the estimate of `step.stable_dt`: `python -m benchmarks.stability.stable_dt`.
 
-A block of particles that fills slip walls with one uniform deformation is at equilibrium whatever its prestress. It is
+A block of particles with one uniform deformation between slip walls is in equilibrium for any prestress. It is
 disturbed by noise of 1e-7 of the wave speed, so that the motion stays linear; a step is stable if the noise does not
 grow a hundredfold. Many steps are tried at once, as the scenes of a batch, then the bracket is refined. A case that is
-unstable at 0.9 of the estimate and, over three times the time, at a tenth of it is unstable whatever the step.
+unstable at 0.9 of the estimate and, over three times the time, at a tenth of it is unstable for any step.
 """
 
 from __future__ import annotations
