@@ -3,7 +3,7 @@
     python -m benchmarks.accuracy.rollout_gradients             # minutes on 2 cores
     python -m benchmarks.accuracy.rollout_gradients --quick     # seconds
 
-Three problems in two dimensions, each with a loss of the end and several inputs together:
+Three problems in two dimensions, each with a loss of the end and several causes together:
 
 - contact: an elastic block falls on a moving ball with friction and then to the floor; causes are its velocities, its
   stiffness, gravity, the place and the velocity of the ball, and the time step.
