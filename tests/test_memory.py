@@ -103,3 +103,24 @@ def test_the_command_line_says_what_was_wanted(monkeypatch, capsys):
     monkeypatch.setattr(cli, "_schema", command)
     assert cli.main(["schema"]) == 1
     assert capsys.readouterr().err.startswith("torch-mpm: out of memory: 1.15e+09 GB were wanted; ")
+
+
+def test_too_little_address_space_is_an_error_before_compiled_code_ends_the_process(monkeypatch, capsys):
+    pytest.importorskip("h5py")
+    from torch_mpm.data.hdf5 import h5py_module
+
+    monkeypatch.setattr(memory, "_of_process", lambda: 1e6)
+    h5py_module()  # without a limit, whatever is free
+    monkeypatch.setattr(memory, "_limit", lambda: 10**9)
+    with pytest.raises(MemoryError, match=r"HDF5 takes about 16\.8 MB of address space, and 1 MB are available"):
+        h5py_module()
+    assert cli.main(["schema"]) == 1
+    assert "out of memory: a command with the packages that it imports takes about 67.1 MB" in capsys.readouterr().err
+
+
+def test_memory_that_cannot_be_looked_at_is_none(monkeypatch):
+    def short():
+        raise MemoryError
+
+    monkeypatch.setattr(memory, "_of_machine", short)
+    assert memory.available() == 0.0 and "0 bytes are free" in memory.shortage(MemoryError("x"))

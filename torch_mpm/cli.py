@@ -33,6 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         with signals_raise(came), warnings_in_lines():
             options = _parser().parse_args(arguments)
+            memory.require_address_space(LEAST, "a command with the packages that it imports")
             options.command(options)
     except KeyboardInterrupt as error:
         return _ended(type(error))
@@ -113,6 +114,8 @@ TOLD = (
 )  # fmt: skip
 
 
+LEAST = 2**26
+"""Address space of the smallest command [bytes]."""
 NOTHING = 2**22
 """Memory below which anything may fail, with any message [bytes]."""
 

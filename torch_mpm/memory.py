@@ -29,7 +29,10 @@ WANTED = re.compile(r"you tried to allocate (\d+) bytes")
 
 def available() -> float:
     """Memory that can be allocated without swapping [bytes]; infinite where unknown."""
-    return min(_of_machine(), _of_process(), *(_of_container(*files) for files in LIMITS))
+    try:
+        return min(_of_machine(), _of_process(), *(_of_container(*files) for files in LIMITS))
+    except MemoryError:
+        return 0.0
 
 
 def in_words(size: float) -> str:
@@ -66,6 +69,17 @@ def require(size: float, purpose: str) -> None:
     """Raise MemoryError where less memory is available than the known requirement."""
     if (free := available()) < size:
         raise MemoryError(f"{purpose} takes about {in_words(size)}, and {in_words(free)} are available")
+
+
+def require_address_space(size: float, purpose: str) -> None:
+    """Raise MemoryError where the limit of the address space (ulimit -v) leaves less than the known requirement.
+
+    Compiled libraries end the process where they cannot allocate memory. Without a limit the check costs nothing.
+    """
+    if _limit() and (free := _of_process()) < size:
+        raise MemoryError(
+            f"{purpose} takes about {in_words(size)} of address space, and {in_words(free)} are available"
+        )
 
 
 def _limit() -> int:

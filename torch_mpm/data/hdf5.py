@@ -32,7 +32,12 @@ MOST_EXPANSION = 1032
 """Bytes that one compressed byte can become (zlib's own limit)."""
 
 
+HDF5_SPACE = 2**24
+"""Address space for a call of HDF5, which may crash with less [bytes]."""
+
+
 def h5py_module() -> Any:
+    memory.require_address_space(HDF5_SPACE, "a file in HDF5")
     return optional.load("h5py", "trajectories", "data")
 
 

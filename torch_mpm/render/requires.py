@@ -11,6 +11,10 @@ SIZES = {"vtk": 7e8, "vtkmodules": 7e8, "matplotlib": 2e8}
 """Maximum memory of the import of a package [bytes]: VTK and kiwisolver end the process where it fails."""
 
 
+VTK_SPACE = 1.4e9
+"""Maximum address space of VTK up to its first picture, with the threads of a software OpenGL [bytes]."""
+
+
 class RenderError(RuntimeError):
     """A picture cannot be made on this machine; the message says what to install."""
 
@@ -24,4 +28,6 @@ def require(module: str) -> Any:
     package = module.partition(".")[0]
     if package in SIZES and package not in sys.modules:
         memory.require(SIZES[package], f"the import of {package} for pictures")
+        if package.startswith("vtk"):
+            memory.require_address_space(VTK_SPACE, "a picture by vtk")
     return optional.load(module, "pictures", "render")
