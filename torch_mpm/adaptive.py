@@ -232,7 +232,7 @@ class Clocks:
         return state.replace(time=self.now.clone())
 
     def _limit(self, state: State) -> Tensor:
-        """Longest stable dt of each scene, of which the previous dt is a share."""
+        """Longest stable dt of each scene; the previous dt becomes a fraction of it."""
         limit = 1 / self.step.survey(state, judge=False).rate
         self._count_cfl(limit, self.substeps > 0)
         return limit

@@ -180,7 +180,7 @@ class Environments:
         Args:
             which: bool [B], which may be on the device, or indices of scenes.
             states: None for the initial states. Otherwise a list, or the result of `pack` of one, with a state for each
-                index in turn; with a mask, one for each of the B scenes, of which those of the mask are used.
+                index in turn; with a mask, one for each of the B scenes; only those in the mask are used.
 
         Raises:
             TypeError, ValueError: for states without room, or another number of them.

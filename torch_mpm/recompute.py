@@ -18,7 +18,7 @@ from torch import Tensor
 
 
 def called_again(function: Callable[..., Any], *tensors: Tensor) -> Any:
-    """`function(*tensors)` of which autograd stores the arguments only.
+    """Result of `function(*tensors)`; autograd stores the arguments only.
 
     The function is called again with the original random numbers, autocast and default device.
 

@@ -55,7 +55,7 @@ def yield_value(h: Array, alpha: Array, ratio: Array, unilateral: bool) -> Array
 
 
 def bisect(above: Any, low: Array, high: Array, steps: int) -> tuple[Array, Array]:
-    """Halves [low, high], of which `above` is true at the upper end."""
+    """Bisection of [low, high], where `above` is true at the upper end."""
     for _ in range(steps):
         middle = (low + high) / 2
         right = above(middle)

@@ -2,16 +2,17 @@
 
 A full energy resists the trial tension that the return map removes only after the solve; the unilateral one has none.
 
-Cohesion: a block of sand is pulled apart at 2 /s in one step; share of the rate that is left, 1 without cohesion.
+Cohesion: a block of sand is pulled apart at 2 /s in one step. Result: remaining fraction of the rate, 1 without
+cohesion.
 
-Clump: a block of 8 × 4 cells of 2.5 cm flies apart at 2 /s along x for a quarter of a second without weight, in which
-its extent grows by a half; share of that growth, 1 without cohesion, and the tensile impulse that the halves have on
-each other, over the momentum of each at the start. Explicit steps at half their limit.
+Clump: a block of 8 × 4 cells of 2.5 cm flies apart at 2 /s along x for a quarter of a second without weight, which
+extends it by a half. Results: fraction of that extension, 1 without cohesion; tensile impulse between the halves,
+relative to the momentum of each at the start. Explicit steps take half of their limit.
 
-Collapse: a column of 10 × 20 cells of 1 cm (φ = 30°), as stiff as a compression of 2% at its foot needs, is let go on
-a rough floor and spreads for 6 √(H/g), by APIC, which damps at each transfer, and by FLIP; run-out (half the width that
-holds 98% of the mass, less the half width at the start, over it) and height of the deposit. Times are those of the
-processor, on one thread.
+Collapse: a column of 10 × 20 cells of 1 cm (φ = 30°), so stiff that its foot is compressed by 2%, is released on a
+rough floor and spreads for 6 √(H/g), by APIC, which damps at each transfer, and by FLIP. Results: run-out (half the
+width that holds 98% of the mass, minus the initial half width, relative to the latter) and height of the deposit.
+Times are those of the processor, on one thread.
 """
 
 from __future__ import annotations

@@ -97,7 +97,7 @@ def text(result: dict[str, Any]) -> str:
     lines = ["# Checkpoints of rollouts", "", common.describe(result["environment"]), ""]
     lines += [(__doc__ or "").split("\n\n", 2)[2].strip(), ""]
     lines += [f"{result['cases'][0]['particles']} particles, float32, {result['steps']} steps.", ""]
-    header = ("law", "kept", "memory [MB]", "estimated", "seconds", "estimated", "steps taken")
+    header = ("law", "stored", "memory [MB]", "estimated", "seconds", "estimated", "steps taken")
     rows = [
         (
             c["law"],

@@ -1,8 +1,9 @@
 """Times of the laws: `python -m benchmarks.speed.laws [--device cuda]`.
 
-float32, 3-D, structure of arrays, states of which about half flow: return map with stress and history, with the
-dissipated energy, and its backward pass with the gradients of F, parameters and history. "of memory": the time to copy
-or read, whichever is faster, the bytes that the update must read and write, over the time of the update.
+Cases: float32, 3-D, structure of arrays; about half of the states flow. Timed are the return map with stress and
+history, the same with the dissipated energy, and its backward pass with the gradients of F, parameters and history.
+"of memory": lower bound over the time of the update; the bound is the time in which the faster of a copy and a read
+moves the bytes that the update must read and write.
 """
 
 from __future__ import annotations

@@ -320,10 +320,10 @@ def text(result: dict[str, Any]) -> str:
     rows = [(*row_of_steps(r), r["seconds"]) for r in result["scenes"]]
     lines += [common.table((*header, "simulation, s"), rows), ""]
     if rows := [row_of_peer(r) for r in result.get("peers", ())]:
-        header = ("a step", "of", "particles", "us", "rollout so many times as fast")
+        header = ("a step", "of", "particles", "us", "speed-up by the rollout")
         lines += [common.table(header, rows), ""]
     if rows := [row_beside(r) for r in result.get("plain", ())]:
-        header = ("scene", "particles of Warp's plain step", "us", "scene so many times as fast")
+        header = ("scene", "particles of Warp's plain step", "us", "speed-up by the scene")
         lines += [common.table(header, rows), ""]
     return "\n".join(lines)
 

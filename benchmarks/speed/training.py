@@ -245,7 +245,7 @@ def row_of_rollout(r: dict[str, Any]) -> tuple[Any, ...]:
 
 
 BESIDE = (
-    "work of", "program", "kept", "particles", "steps", "forward, ms a step", "times",
+    "work of", "program", "stored", "particles", "steps", "forward, ms a step", "times",
     "forward and backward, ms a step", "times", "memory, MB", "times, a step",
 )  # fmt: skip
 

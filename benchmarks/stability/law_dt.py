@@ -110,9 +110,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="a few cases, to see that it works")
     parser.add_argument("--out", type=Path, default=common.RESULTS)
     parser.add_argument("--device", default="cpu")
-    parser.add_argument(
-        "--again", type=Path, help="result of before, of which only what was unstable is measured again"
-    )
+    parser.add_argument("--again", type=Path, help="earlier result; only its unstable cases are measured again")
     arguments = parser.parse_args()
     common.use_all_cores()
     begin = time.perf_counter()

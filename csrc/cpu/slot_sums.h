@@ -6,7 +6,7 @@
 namespace mpm::cpu {
 inline namespace TORCH_MPM_ISA {
 
-// In the order of the slots, any of which may be unused: consecutive slots of one row are summed in float64.
+// Sums in the order of the slots: consecutive slots of one row are summed in float64. Any slot may be unused.
 template <class Value>
 void add_up(const SlotSums<Value>& a) {
   constexpr int most = 16;  // columns at a time

@@ -24,8 +24,9 @@ inline int device_attribute(cudaDeviceAttr attribute) {
   return value;
 }
 
-// Thread blocks for `count` pieces of work in a grid-stride loop. Many more than fit at once, so that the hardware
-// balances them, but not so many that empty ones cost time when `count` is a generous bound.
+// Number of thread blocks for `count` work items in a grid-stride loop. It exceeds the number of resident blocks by
+// far, so that the hardware balances the load, and is limited, because empty blocks cost time where `count` is a
+// generous bound.
 inline unsigned grid_size(int64_t count) {
   const int processors = device_attribute(cudaDevAttrMultiProcessorCount);
   return unsigned(std::clamp<int64_t>(count, 1, int64_t(processors) * 128));

@@ -51,8 +51,8 @@ struct HeatWeights {
   }
 };
 
-// θ, g, weight w and the share of a second weight in it: w θ of each weight, then the weights, for `scatter`; and their
-// moments w g, of which those of the weights themselves are zero.
+// Sums of θ with a weight w and with a share of it as second weight, for `scatter`: w θ for each weight, then the
+// weights; and their moments w g, zero for the weights themselves.
 template <int Weights>
 struct HeatMoments {
   static constexpr const char* name = Weights == 1 ? "heat_moments_1" : "heat_moments_2";

@@ -14,7 +14,7 @@
 // The contribution of a particle to a node is N_i (a + B · i) + G · ∇N_i, i being the distance from the base node in
 // cells: `Linear` channels of this kind after `Plain` ones with B = G = 0. In deterministic mode particles are linked
 // in the order of the index tensor, and the result of an item is added in fixed point, or block by block: blocks of one
-// colour at a time, no two of which share a node.
+// colour at a time; blocks of one colour share no node.
 namespace mpm::cuda {
 
 template <class T>

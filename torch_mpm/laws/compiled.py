@@ -45,7 +45,7 @@ PLASTIC_VOLUME = "log_plastic_volume"
 ARGUMENTS = {"eta": "viscosity"}
 """Names of arguments that are stored under another name."""
 _OF_MODULES = frozenset(vars(nn.Module()))
-"""Attributes of every module, of which no parameter is made."""
+"""Attributes that every module has; none becomes a parameter."""
 FIGURES = ("stress", "stiffness", "energy_density")
 """Values of a law that a survey needs."""
 
