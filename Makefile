@@ -1,5 +1,5 @@
 # Targets: build, test, check, format, demo, examples, wheel, bench, study, sanitize, gpu, clean (see CONTRIBUTING.md).
-# PYTHON makes the virtual environment; TORCH is installed there unless torch is already present.
+# PYTHON creates the virtual environment; version TORCH of torch is installed there unless torch is present.
 PYTHON ?= python3
 TORCH ?= 2.13.0
 VENV ?= .venv
@@ -14,16 +14,16 @@ SOURCES := $(shell find csrc -name '*.h' -o -name '*.cuh' -o -name '*.cpp' -o -n
 build: $(STAMP)
 	$(PY) setup.py -q build_ext --inplace
 
-# What a user needs: the CPU library, and the CUDA library where there is a GPU. `build` adds the module of the tests.
+# Libraries for users: CPU, and CUDA where there is a GPU. `build` adds the module of the tests.
 libraries: $(STAMP)
 	$(PY) setup.py -q build_ext --inplace --targets=cpu,cuda
 
-# One library alone: cpu, cuda or math (the pybind11 module of the tests).
+# A single library: cpu, cuda or math (the pybind11 module of the tests).
 build-cuda: export TORCH_MPM_CUDA = 1
 build-%: $(STAMP)
 	$(PY) setup.py -q build_ext --inplace --targets=$*
 
-# The environment is only linked to the sources here; `build` compiles, with its progress in sight.
+# This rule only links the environment to the sources; `build` compiles, and shows its progress.
 $(STAMP): pyproject.toml
 	test -x $(PY) || $(PYTHON) -m venv $(VENV)
 	$(PY) -c "import torch" 2>/dev/null || $(PY) -m pip install -q torch==$(TORCH)
@@ -31,7 +31,8 @@ $(STAMP): pyproject.toml
 	TORCH_MPM_SKIP_BUILD=1 $(PY) -m pip install -q --no-build-isolation -e '.[dev]'
 	touch $@
 
-# A process per core, with one thread each; then those with loops of every kind again, with all threads in one process.
+# One process per core, with one thread each; then the tests of all kinds of threaded loops, in one process with all
+# threads.
 THREADED := tests/test_rollouts.py tests/test_topology.py tests/ops/test_transfer_cpu.py tests/boundaries/test_contact.py
 test: build
 	OMP_NUM_THREADS=1 $(PY) -m pytest $(QUICK) -n auto --dist worksteal
@@ -55,14 +56,14 @@ demo: libraries
 	$(PY) -m torch_mpm generate examples/datasets/demo.toml -o out/demo_dataset
 	$(PY) -m torch_mpm finalize out/demo_dataset
 
-# Each scene in a folder of its own. A scene that is done is skipped, an unfinished one goes on.
+# Each scene has its own folder. Finished scenes are skipped, unfinished ones are resumed.
 examples: $(patsubst examples/%.toml,out/%/trajectory.h5,$(wildcard examples/*.toml))
 
 out/%/trajectory.h5: examples/%.toml | libraries
 	$(PY) -m torch_mpm run $< -o $(@D) --resume
 
-# For every machine: all instruction-set levels, and two GPU architectures where nvcc is found. What an earlier build has
-# left in build/lib* would go into the wheel too.
+# Wheel for every machine: all instruction-set levels, and two GPU architectures where nvcc is found. build/lib* is
+# removed first, because files of an earlier build would be packed too.
 wheel: $(STAMP)
 	rm -rf build/lib* dist/*.whl
 	$(PY) setup.py -q bdist_wheel
@@ -74,9 +75,8 @@ bench: build
 study: build
 	$(PY) -m pytest -q -m slow
 
-# The CPU library with the address and undefined-behaviour sanitizers, for this machine's instruction set, in a package
-# tree of its own. The C++ library comes with the first libraries of the process, or the sanitizer does not find the
-# function that throws.
+# Tests of a CPU library with the address and undefined-behaviour sanitizers, for this machine's instruction set, in a
+# separate package tree. libstdc++ is preloaded, because otherwise the sanitizer does not find the function that throws.
 SANITIZED := build/sanitized
 SANITIZERS := address,undefined
 PRELOAD = $(foreach name,libasan.so libstdc++.so.6,$(shell $(or $(CXX),g++) -print-file-name=$(name)))
@@ -85,7 +85,8 @@ sanitize: $(STAMP)
 	LD_PRELOAD='$(PRELOAD)' ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=halt_on_error=1:print_stacktrace=1 \
 	  TORCH_MPM_SANITIZE=$(SANITIZERS) TORCH_MPM_CUDA=0 PYTHONPATH=$(CURDIR)/$(SANITIZED):$(CURDIR) $(VENV)/bin/pytest $(QUICK)
 
-# On a GPU machine whose Python already has torch, ninja and pytest: no virtual environment and no network.
+# Build, tests and benchmarks on a GPU machine with torch, ninja and pytest in its Python, without a virtual environment
+# and without network access.
 gpu:
 	TORCH_MPM_CUDA=1 TORCH_MPM_ISA_LEVELS=all $(PYTHON) setup.py -q build_ext --inplace
 	PYTHONPATH=. $(PYTHON) -m benchmarks.tests --processes $(shell nproc)

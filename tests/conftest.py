@@ -21,7 +21,7 @@ DEVICES = ["cpu", *([pytest.param("cuda", marks=pytest.mark.cuda)] if CUDA else 
 
 
 def pytest_configure() -> None:
-    """A machine with a GPU tests it, or is told by TORCH_MPM_CUDA=0 not to: its tests never vanish in silence."""
+    """Fail where a GPU is present but not usable, unless TORCH_MPM_CUDA=0: its tests are never skipped silently."""
     if not CUDA and setup.gpu_present() and os.environ.get("TORCH_MPM_CUDA") != "0":
         reason = _library.cuda_error or f"torch {torch.__version__} finds no CUDA device"
         raise pytest.UsageError(f"this machine has a GPU, but {reason}. TORCH_MPM_CUDA=0 tests the CPU alone.")

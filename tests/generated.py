@@ -1,4 +1,4 @@
-"""A small configuration of a data set, and what tests ask of generated folders."""
+"""A small configuration of a data set, and helpers of tests for generated folders."""
 
 import copy
 import multiprocessing

@@ -1,4 +1,4 @@
-"""Scenes that reach a time in steps of their own, against loops of single steps that ask for the limit themselves."""
+"""Scenes that reach a time with their own time steps, against loops of single steps that compute the limit."""
 
 import math
 
@@ -12,7 +12,7 @@ import torch_mpm as mpm
 F64 = torch.float64
 END = 0.06
 STIFFNESS = (1e3, 3e4, 2e5)
-"""Of three scenes, of which the last needs some 14 times the substeps of the first."""
+"""Young's moduli of three scenes [Pa]; the last needs about 14 times the substeps of the first."""
 
 
 def box(dim: int, **options) -> mpm.Grid:

@@ -376,7 +376,7 @@ def test_materials_and_order_by_content(device, recorded):
         for ids in (*orders, orders[0]):
             given = state.replace(ids=ids)
             assert_equal(mpm.rollout(step, given, 4, DT, graph=2), one_by_one(again, given, 4, DT))
-        step.law.E.mul_(2)  # of which steps keep a copy
+        step.law.E.mul_(2)  # steps store a copy of E
         again.law.E = step.law.E.clone()
         assert_equal(mpm.rollout(step, given, 4, DT, graph=2), one_by_one(again, given, 4, DT))
 
@@ -395,7 +395,7 @@ def test_states_are_not_kept(device, recorded):
 
 
 def test_graphs_go_with_their_step(device, recorded):
-    """At once: a loop over steps must not keep the memory of their graphs until somebody looks for cycles."""
+    """At once: a loop over steps must not keep the memory of their graphs until the garbage collector runs."""
     step, state = blown(device)
     with torch.no_grad():
         mpm.rollout(step, state, 4, DT, graph=2)
@@ -411,7 +411,7 @@ def test_graphs_go_with_their_step(device, recorded):
 
 
 def test_under_autocast_and_without_gradients_for_good(device, recorded):
-    """Of which graphs are others: half precision is that of the call, and tensors of inference mode stay there."""
+    """Separate graphs: half precision is that of the call, and tensors of inference mode stay in inference mode."""
     step, state = mixed(device)
     step, state = step.float(), state.to(dtype=torch.float32)
     with torch.inference_mode():

@@ -76,9 +76,9 @@ def test_gradients_are_those_without(kind, kept, device, monkeypatch):
 
 @pytest.mark.parametrize("function", [False, True])
 def test_pools_that_grow_are_those_of_the_first_time(function):
-    """A block that flies apart wants more blocks in each segment; steps that are taken again have those they had, also
-    where a function of the user's takes them on a grid that nobody else knows of. Not on CUDA, where a pool grows when
-    the device has told, and steps before that may overflow."""
+    """A body that flies apart needs more blocks in each segment; recomputed steps use the original pool size, also
+    where a user function computes them, on a grid unknown to the library. Not on CUDA, where a pool grows once the
+    device has reported its need, and earlier steps may overflow."""
     found, sizes = [], []
     for checkpoint in (None, 5, mpm.Checkpoints(states=3)):
         grid = mpm.Grid(0.02, (0, 0), (1, 1), deterministic=True)
@@ -155,7 +155,7 @@ def test_implicit_steps_that_are_taken_again_do_not_count_again(checkpoint, devi
 
 @pytest.mark.parametrize(("n", "states"), [(10, 3), (200, 4), (57, 2), (8, 8)])
 def test_binomial_work_is_the_least(n, states):
-    """Steps that are taken again are as few as can be: r n − C(s + r, r − 1) (Griewank and Walther 2000)."""
+    """The number of recomputed steps is minimal: r n − C(s + r, r − 1) (Griewank and Walther 2000)."""
     repetitions = next(r for r in range(n) if math.comb(states + r, states) >= n)
     least = repetitions * n - math.comb(states + repetitions, repetitions - 1)
     assert mpm.Checkpoints(states=states).repetitions(n) == least
@@ -215,7 +215,7 @@ def test_steps_and_kept_states_are_as_many_as_was_said(n, states):
 
 @pytest.mark.parametrize("memory", [3_000, 10_000, 50_000, 10_000_000])
 def test_what_fits_into_memory(memory):
-    """Kept states and the steps that are held beside them are no more than was asked for."""
+    """Stored states and the recorded steps between them do not exceed the given memory."""
     state, step = 100, 700
     kept = checkpoints.fitting(memory, 1000, state, step)
     if kept is None:

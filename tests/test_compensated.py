@@ -88,7 +88,7 @@ def test_slow_steel_moves_with_all_transfers(options, many, dim, device):
 
 
 def test_slow_steel_moves_for_a_hundred_thousand_steps(device):
-    """In one call, and in calls of which each is a part of the motion."""
+    """In one call, and in calls that are parts of the motion."""
     step, state = block(2, F32, 0.0, device)
     one = mpm.rollout(step, state, 100_000, DT)
     assert relative_error(moved(state, one), state.v.double().cpu() * 1e5 * DT) < 1e-3
@@ -175,7 +175,7 @@ def test_paused_scenes_keep_their_residual(dim):
 @pytest.mark.parametrize("way", ["rollout", "checkpoint", "memory", "steps"])
 @pytest.mark.parametrize("law", ["solid", "fluid", "plastic"])
 def test_gradients_are_those_without_compensation(way, law, dim, device):
-    """To the rounding of float64, whichever steps are recorded or taken again."""
+    """To rounding in float64, for recorded and for recomputed steps."""
     n, kept = 12, {"checkpoint": 4, "memory": mpm.Checkpoints(memory=1e9)}.get(way)
 
     def gradient(compensated):
@@ -293,7 +293,7 @@ def test_a_scene_file_of_slow_steel_moves(tmp_path):
     with mpm.Trajectory(tmp_path / "out") as read:
         x, speed = read["position"].astype(float), read["velocity"][-1, :, 0]
     assert (speed > 0.9 * SPEED).all()
-    assert (x[-1] - x[0])[:, 0].mean() == pytest.approx(SPEED * 4e-4, rel=0.01)  # of which rounding is 3e-8 m
+    assert (x[-1] - x[0])[:, 0].mean() == pytest.approx(SPEED * 4e-4, rel=0.01)  # rounding: 3e-8 m
     built = scene.build()
     state = mpm.rollout(built.step, built.state, 3, DT)
     save(tmp_path / "state.h5", tensors_of(state), {"time": float(state.time)})

@@ -92,7 +92,7 @@ def test_tiny_and_huge_masses(scale, dim, device):
 
 
 def test_a_number_that_is_not_finite(dim, device):
-    """Spreads as it does elsewhere, and is told of in the same step."""
+    """It spreads as in single steps, and is reported in the same step."""
     state = few.body(dim, device)
     v = state.v.clone()
     v[7] = torch.inf

@@ -19,5 +19,5 @@ def test_programs_of_a_document(name: str, monkeypatch: pytest.MonkeyPatch) -> N
     programs = list(re.finditer(r"```python\n(.*?)```", text, re.DOTALL))
     assert programs
     for found in programs:
-        line = text.count("\n", 0, found.start(1))  # so that errors tell the line of the document
+        line = text.count("\n", 0, found.start(1))  # so that errors name the line of the document
         exec(compile("\n" * line + found[1], name, "exec"), vars(module))

@@ -57,7 +57,7 @@ def environments(device: str, count: int = 4) -> mpm.Environments:
 
 
 def test_scenes_of_any_size_are_what_they_are_alone(device):
-    """Size, throw, stiffness and gravity of their own; absent particles are not noticed, nor told of."""
+    """Each has its own size, throw, stiffness and gravity; absent particles have no effect and are not reported."""
     envs = environments(device)
     assert envs.step.explain(envs.state).startswith("all steps in one op")
     envs.advance(N, DT)

@@ -1,4 +1,4 @@
-"""What goes wrong is told for each scene: what, when, how many and which particle, and nobody else is touched."""
+"""Failures reported per scene (kind, time, number of particles, first particle) without effect on other scenes."""
 
 import copy
 import pickle
@@ -45,7 +45,7 @@ def test_each_scene_keeps_its_own_first_problem(device, dim, kernel):
             x[bad[p.scene.cpu()[bad] != activation % 4], 0] = value
     assert len({row[6] for row in rows}) > 2  # the scenes failed at different times
     first = min(row[6] for row in rows if row[6] >= 0)
-    for entry in (1, 3):  # row 0 tells of the first activation of all that had a problem
+    for entry in (1, 3):  # row 0 is that of the first activation with a problem in any scene
         assert int(status[0, entry]) == sum(row[entry] for row in rows if row[6] == first)
 
 

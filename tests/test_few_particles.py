@@ -51,7 +51,7 @@ def test_more_particles_than_a_cluster_takes(transfer, dim, device):
 
 @pytest.mark.parametrize("high", [0.6, 0.65])
 def test_crowded_blocks(high, dim, device):
-    """Of which an item has more than in steps of single kernels, once a call knows how few blocks there are."""
+    """Items have more particles than in steps of single kernels, once a call knows the small number of blocks."""
     state = crowd(dim, device, high)
     step, single = make(dim, max_blocks=None), make(dim)
     with torch.no_grad():
@@ -115,7 +115,7 @@ def test_scenes_with_time_steps_of_their_own(obstacle, dim, device):
 
 
 def test_particles_that_leave_on_the_way(dim, device):
-    """The status tells when the first one did, and what has left rests, with the deformation that it had."""
+    """The status contains the step of the first one; particles that left rest, with their last deformation."""
     state = body(dim, device, speed=1.0)
     v, x = state.v.clone(), state.x.clone()
     v[5:8, 1] = 40.0

@@ -12,7 +12,7 @@ N, DT = 8, 1e-3
 
 
 def batch(device):
-    """Three scenes of one block, of which the second is at another place and the third is empty."""
+    """Three scenes: a block, a block at another place, and none."""
     states = [block_state(2, device), block_state(2, device, low=0.35, high=0.6)]
     return mpm.State.concatenate(states, scene=True)
 

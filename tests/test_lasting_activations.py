@@ -1,4 +1,4 @@
-"""Activations that serve several substeps of a rollout on the CPU, against single steps, each of which has its own."""
+"""Activations shared by several substeps of a rollout on the CPU, against single steps with one activation each."""
 
 import pytest
 import torch
@@ -12,7 +12,7 @@ MOST_BLOCKS, ACTIVATIONS, PROBLEM, BLOCKS_NOW = 0, 5, 6, 7  # columns of the sta
 
 
 def flow(dim, cells, count=2000, dtype=F64, **fields):
-    """Particles in no order that go about so many cells a step together, and a fifth of that by themselves."""
+    """Unsorted particles with a common motion of about `cells` cells per step, and a fifth of it at random."""
     state = blob("cpu", dim, count, dtype=dtype, **fields)
     along = torch.tensor([1.0, -0.7, 0.4][:dim], dtype=dtype)
     return state.replace(v=(along + 0.2 * state.v) * (cells * box(dim).dx / DT))
@@ -93,7 +93,7 @@ def test_no_room_for_blocks_around(dim):
 @torch.no_grad()
 @pytest.mark.parametrize("poison", [float("nan"), float("inf"), -float("inf"), 1e30])
 def test_a_velocity_that_is_not_of_this_world(poison, dim):
-    """What is near it is lost, what is far from it is as it was, and the status tells when it was."""
+    """Particles near it are lost, distant ones are unchanged, and the status contains the step."""
     ends, statuses = [], []
     for roll in (mpm.rollout, one_by_one):
         step = mpm.Step(box(dim, dx=1 / 32), LAWS_HERE["neo_hookean"]())
@@ -113,7 +113,7 @@ def test_a_velocity_that_is_not_of_this_world(poison, dim):
 
 @torch.no_grad()
 def test_scenes_with_time_steps_of_their_own(dim):
-    """One of which stands still."""
+    """One scene has dt = 0."""
     step = mpm.Step(box(dim, scenes=3), LAWS_HERE["neo_hookean"](), walls="separate")
     scene = torch.arange(2000).remainder(3).int()
     state = step.prepare(flow(dim, 0.1, scene=scene).to(dtype=torch.float32))
@@ -157,8 +157,8 @@ def test_threads_change_nothing_where_particles_stray(dim):
     [(0.0114, 0.064), (0.0201, 0.022), (0.0292, 0.061), (0.0158, 0.14), (0.0471, 0.195), (0.0115, 0.147)],
 )
 def test_the_end_of_a_lattice_far_from_the_origin(cells, left):
-    """A particle goes so many cells a step and has so many left to the end. Its position in float32 is rounded to a
-    hundredth of a cell there, so that it may leave earlier than its velocity tells."""
+    """A particle moves by `cells` per step and starts `left` cells from the end. Its position in float32 is rounded to
+    a hundredth of a cell there, so that it may leave earlier than its velocity implies."""
     dx, lower = 0.0137, 1000.0
     x = torch.tensor([[lower + (154 - 2.5 - left) * dx, lower + 0.2]])
     ends, statuses = [], []
@@ -174,7 +174,7 @@ def test_the_end_of_a_lattice_far_from_the_origin(cells, left):
 
 
 def test_gradients_with_as_many_blocks_as_the_pool_has():
-    """A block is there in some substeps alone: a pool without room for it is told of before gradients want it."""
+    """A block is active in some substeps only; a pool too small for it is reported before the backward pass."""
     dx = 1 / 32
     x = torch.tensor([[10.1 * dx, 10.0 * dx]], dtype=F64)
     v = torch.tensor([[0.1 * dx / DT, 0.0]], dtype=F64).requires_grad_()

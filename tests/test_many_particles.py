@@ -88,7 +88,7 @@ def test_a_time_step_on_the_device(dim, device):
 
 
 def test_parameters_of_particles(dim, device):
-    """Of which each needs its own, wherever it is in memory."""
+    """Each particle gets its own parameter, wherever it is in memory."""
     state = body(dim, device)
     E = 1e4 * (1 + (state.x[:, 0] > 0.5).float())
     step = mpm.Step(mpm.Grid(cell(dim, device), (0,) * dim, (1,) * dim), mpm.NeoHookean(E=E, nu=0.3))
@@ -98,7 +98,7 @@ def test_parameters_of_particles(dim, device):
 
 
 def test_particles_that_leave_on_the_way(dim, device):
-    """The status tells when the first one did and which, and what has left rests, with the deformation that it had."""
+    """The status contains step and id of the first one; particles that left rest, with their last deformation."""
     state = body(dim, device, cells=0.05)
     v, x = state.v.clone(), state.x.clone()
     v[5:8, 1] = 0.8 * cell(dim, device) / dt_of(dim, device)
@@ -118,7 +118,7 @@ def test_particles_that_leave_on_the_way(dim, device):
 
 
 def test_a_number_that_is_not_finite_on_the_way(dim, device):
-    """It spreads as in single steps, and is told of in the same step."""
+    """It spreads as in single steps, and is reported in the same step."""
     state = body(dim, device)
     v = state.v.clone()
     v[7] = torch.inf

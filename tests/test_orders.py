@@ -65,7 +65,7 @@ def test_the_order_comes_back(transfer, dtype, dim, device, sorts):
     end = mpm.rollout(step, state, 9, DT)
     assert sorts == [state] and end.ids is None
     assert_equal(end, expected)
-    for name in ("mass", "volume", "material", "scene"):  # the same tensors, of which caches know
+    for name in ("mass", "volume", "material", "scene"):  # the same tensors, since caches refer to them
         assert getattr(end, name) is getattr(state, name)
     assert end.extra["own"] is state.extra["own"] and end.extra["activation"] is state.extra["activation"]
 

@@ -185,7 +185,7 @@ def test_scenes_without_particles_count(device: str) -> None:
     assert step.prepare(fresh).scenes == B == step(fresh, 1e-5).scenes == step(fresh, 1e-5).sorted(step.grid).scenes
     law.stress(step.prepare(fresh))
     absent = fresh.replace(scene=torch.where(fresh.scene == 1, -1, fresh.scene).int())
-    assert absent.scenes == 1  # of which the tensor was looked at again
+    assert absent.scenes == 1  # counted from the new tensor
     absent.scene[0] = 1
     assert absent.scenes == 2
     mpm.rollout(step, absent, 2, 1e-5)
@@ -403,7 +403,7 @@ def test_times_of_another_batch_are_errors(device: str) -> None:
 
 
 def test_a_time_step_of_whole_numbers_pauses_nothing(device: str) -> None:
-    """It would be zero, of which a paused scene has its name."""
+    """As a whole number it is zero, which pauses a scene."""
     dt = torch.tensor([1e-4], device=device).long()
     with pytest.raises(TypeError, match=r"^dt must be a number or a floating tensor, got torch\.int64"):
         mpm.Step(lattice(), mpm.NeoHookean(**SOLID))(batch(device), dt)
@@ -423,7 +423,7 @@ def test_faces_of_laws(device: str) -> None:
 
     for n in (1, B, P):
         assert energy(n).isfinite().all() and energy(n, B).isfinite().all()
-    assert energy(7, 7).isfinite().all()  # of which some have no particles
+    assert energy(7, 7).isfinite().all()  # some have no particles
     for n in WRONG:
         with pytest.raises(ValueError, match=rf"^mu must have .* got \[{n}\] with B = {B}$"):
             energy(n, B)

@@ -42,7 +42,7 @@ from torch_mpm.ops.grid_update import wall_arguments
 from torch_mpm.rollouts import budget, fused_op
 
 ALL = mpm.Checkpoints(memory=1e9)
-"""No step is taken again."""
+"""Checkpoints without recomputed steps."""
 
 
 def pulled(dim: int, dtype: torch.dtype = F64) -> Tensor:
@@ -152,7 +152,7 @@ def test_a_record_of_all_steps_may_be_gone_through_twice(transfer, device):
     step, state = batch(3, device, transfer)
     v = state.v.clone().requires_grad_()
     end = mpm.rollout(step, state.replace(v=v), STEPS, DT, checkpoint=ALL)
-    assert end.x.grad_fn.saved_tensors[0].numel() > 1000  # nothing is taken again
+    assert end.x.grad_fn.saved_tensors[0].numel() > 1000  # no step is recomputed
     first, second = (torch.autograd.grad(loss(end), v, retain_graph=True)[0] for _ in range(2))
     assert_same({"v": second}, {"v": first})
     again = mpm.rollout(step, state.replace(v=v), STEPS, DT, checkpoint=2)
@@ -163,7 +163,7 @@ def test_a_record_of_all_steps_may_be_gone_through_twice(transfer, device):
 @pytest.mark.parametrize("law", ["neo_hookean", "viscoelastic", "sand"])
 @pytest.mark.parametrize("transfer", SOME_TRANSFERS)
 def test_grids_are_kept_where_particles_are_dense(law, transfer, device):
-    """With obstacles; gradients are those of steps that were taken again."""
+    """With obstacles; gradients equal those of recomputed steps."""
     one, _ = batch(2, device)
     options = {"walls": "slip", "boundaries": one.boundaries.entries, **TRANSFERS[transfer]}
     step = mpm.Step(box(2), with_gradients(LAWS_HERE[law]()), pulled(2), **options)
@@ -401,7 +401,7 @@ def test_the_raw_ops(device):
     given = [t.clone().requires_grad_() if i in wanted else t for i, t in enumerate(call)]
     torch.library.opcheck(torch.ops.torch_mpm.substeps.default, tuple(given), raise_exception=True)
     recorded = (*given[:40], True, None, *given[42:])
-    checks = ("test_schema", "test_faketensor")  # others compare bytes that nobody has written
+    checks = ("test_schema", "test_faketensor")  # the others compare uninitialised bytes
     torch.library.opcheck(torch.ops.torch_mpm.substeps.default, recorded, test_utils=checks, raise_exception=True)
     grads = [torch.randn_like(t) for t in torch.ops.torch_mpm.substeps(*call)[:6] if t is not None]
     adjoint = (*grads[:4], None, grads[4], torch.ones_like(call[41]), 15, None, *call)

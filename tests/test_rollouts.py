@@ -102,8 +102,8 @@ def test_particles_leave_the_blocks_they_were_found_in(dim, device, cells, kerne
 
 
 def streams(dim: int, device: str, transfer: str = "apic") -> tuple[mpm.Step, mpm.State]:
-    """Two scenes of a mixture in no order, each of which flows through many blocks, in part out of the domain; with
-    parameters of particles, and an obstacle that moves."""
+    """Two scenes of a mixture in no order, flowing through many blocks and in part out of the domain; with parameters
+    per particle, and a moving obstacle."""
     g = torch.Generator().manual_seed(8)
     count, dt = 3000, 1e-4
     stiffness = 1e3 * (1 + torch.rand(count, generator=g, dtype=F64)).to(device)
@@ -128,7 +128,7 @@ def streams(dim: int, device: str, transfer: str = "apic") -> tuple[mpm.Step, mp
 @torch.no_grad()
 @pytest.mark.parametrize("transfer", TRANSFERS)
 def test_particles_that_flow_through_many_blocks(transfer, dim, device):
-    """On the CPU the op moves them about in memory, and nobody sees it."""
+    """On the CPU the op sorts them in memory, without a visible effect."""
     step, state = streams(dim, device, transfer)
     assert in_one_op(step, state)
     again, _ = streams(dim, device, transfer)
@@ -198,7 +198,7 @@ def test_a_full_pool_is_reported_by_the_call_that_fills_it(device):
 
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
 def test_a_pool_that_was_too_small_for_some_steps_is_told_when_it_has_grown(device, dtype):
-    """On CUDA it grows between calls; on the CPU within them, so that there is nothing to tell."""
+    """On CUDA the pool grows between calls; on the CPU within them, so that there is nothing to report."""
     step = mpm.Step(box(2, dx=0.005), mpm.NeoHookean(E=1e3, nu=0.3), transfer="pic")
     state = blob(device, 2, 200, dtype=dtype)
     state = state.replace(x=0.45 + 0.1 * state.x, v=1000 * (state.x - 0.5))

@@ -165,7 +165,7 @@ def test_distance_alone(dim, device):
 
 
 def test_gradient_of_the_distance_from_a_box(device):
-    """On a face it is the normal, also where the distance alone is asked for; a pose that is NaN touches nothing."""
+    """On a face it is the normal, also if only the distance is computed; with a NaN pose there is no contact."""
     box = shapes.Box((1.0, 1.0))
     x = torch.tensor([[0.5, 0.1]], dtype=torch.float64, device=device).requires_grad_()
     (gradient,) = torch.autograd.grad(box.signed_distance(x).sum(), x)

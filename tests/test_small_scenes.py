@@ -86,7 +86,7 @@ def test_scenes_with_time_steps_of_their_own(obstacle, device):
 
 @pytest.mark.parametrize("deterministic", [False, True])
 def test_particles_that_leave_on_the_way(deterministic, device):
-    """The status tells of the first step in which they did, in each scene, and with their ids."""
+    """The status contains the first step in which they did, for each scene, and their ids."""
     blocks = [block_state(2), block_state(2), block_state(2)]
     for k, speed in ((0, 150.0), (2, 70.0)):
         v = blocks[k].v.clone()

@@ -8,7 +8,7 @@ import torch_mpm as mpm
 
 
 def block(count: int, device: str = "cpu", at: float = 0.3, **fields: object) -> mpm.State:
-    """`count` particles of a 2-D scene, told apart by their mass."""
+    """`count` particles of a 2-D scene, distinguished by their mass."""
     x = at + 0.3 * torch.rand(count, 2, dtype=torch.float64)
     mass = 1e-3 * (1 + torch.rand(count, dtype=torch.float64))
     state = mpm.State(x=x, v=torch.zeros_like(x), mass=mass, volume=torch.full_like(mass, 1e-3))

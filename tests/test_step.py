@@ -61,7 +61,7 @@ def test_momentum_is_conserved(device, dim, options):
 
 @pytest.mark.parametrize("many", [False, True])
 def test_a_step_that_was_moved_goes_on(device, many):
-    """What it has told of the steps before comes along."""
+    """The status of earlier steps moves with it."""
     step = make_step(2)
     state = block_state(2)
     with torch.no_grad():

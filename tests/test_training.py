@@ -192,7 +192,7 @@ def test_the_size_of_a_batch_does_not_change_gradients(kind, device):
 
 
 def test_training_is_the_same_from_a_seed(device):
-    """To the last bit, with dropout in the network and states that are taken again."""
+    """Equal bit by bit, with dropout in the network and recomputed states."""
     ends = []
     for _ in range(2):
         torch.manual_seed(3)

@@ -25,7 +25,7 @@ GRAVITY = (1.0, -9.8, 0.5)
 
 
 def obstacles(dim: int, in_torch: bool = False) -> list:
-    """Several that overlap, of all kinds, some of which come or go."""
+    """Several overlapping obstacles of all kinds; some begin or end during the run."""
     at = (0.5, 0.25, 0.5)[:dim]
     turning = 3.0 if dim == 2 else (1.0, -2.0, 3.0)
     ball = mpm.Sphere(at, 0.15, friction=0.2, velocity=(0.1, 0.2, -0.1)[:dim], angular_velocity=turning)

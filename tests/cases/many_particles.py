@@ -14,12 +14,12 @@ def cell(dim, device):
 
 
 def dt_of(dim, device):
-    """In which a wave goes less than a third of a cell."""
+    """Time step in which a wave travels less than a third of a cell."""
     return 0.08 * cell(dim, device)
 
 
 def body(dim, device, cells=0.15):
-    """That goes so many cells a step, in a random order."""
+    """Block of particles in random order that moves by `cells` per step."""
     state = block_state(dim, low=0.25, high=0.75, dx=cell(dim, device), spin=5.0)
     assert device == "cpu" or len(state) >= 2**18
     along = torch.tensor([1.0, -0.4, 0.6][:dim], dtype=F64) * cells * cell(dim, device) / dt_of(dim, device)

@@ -93,7 +93,7 @@ def plain(f, *tensors):
 
 
 def test_a_time_that_is_given(device):
-    """A call at a time is that of a solver that has reached it, and the solver goes on from there."""
+    """A call with a time equals that of a solver at this time."""
     x, v, C, F = (t.detach() for t in start(device))
     solver, other = made(CONDITIONS["translation"], device), made(CONDITIONS["translation"], device)
     other.time = 4 * DT

@@ -41,7 +41,7 @@ class Restated:
 
 
 def bodies(eps, device):
-    """Two boxes, one of which comes later: model, statics, initial tensors and the restated simulator."""
+    """Two boxes, the second one added later: model, statics, initial tensors and the restated simulator."""
     model = sim.MPMModelBuilder().parse_cfg(SIM | {"eps": eps}).finalize(device, requires_grad=True)
     shape = {"type": "cube", "center": [0.4, 0.2, 0.5], "size": [0.2, 0.2, 0.1], "resolution": 5, "mode": "random"}
     low = sim.MPMInitData.get({"rho": 1e3, "clip_bound": 0.5, "span": [0, 1000], "shape": shape})

@@ -387,7 +387,7 @@ def test_a_sampling_file_is_loaded(tmp_path):
 
 
 def test_substeps_are_taken_together(device):
-    """They take one op, whatever is asked for in between is right, and a change acts from its time on."""
+    """They run in one op, results read in between are correct, and a change acts from its time on."""
     sim, _ = pair({"E": 1e5, "nu": 0.3, "density": 500.0}, shear, device)
     sim.finalize_mu_lam()
     sim.add_bounding_box()

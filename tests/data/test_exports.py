@@ -471,7 +471,7 @@ def test_an_export_appears_whole_or_not_at_all(flat, tmp_path, export, monkeypat
 
 
 def test_unfinished_and_empty_splits_are_left_out(tmp_path):
-    source = datasets.make_dataset(tmp_path / "set", shards=1)  # scenes 0 to 3, of which 3 failed
+    source = datasets.make_dataset(tmp_path / "set", shards=1)  # scenes 0 to 3; scene 3 failed
     folder = data.export_gns(source)
     assert sorted(p.name for p in folder.iterdir()) == ["metadata.json", "train.npz"]
     assert len(list(gns_samples(folder / "train.npz"))) == 3 * (FRAMES - 6)

@@ -50,7 +50,7 @@ def test_a_video_has_the_frames(path, tmp_path):
     _, video = draw_scenes(path, tmp_path, scenes=[0], frames=1, width=400, progress=lambda k, of: seen.append((k, of)))
     reader = iio.read_frames(str(video))
     assert next(reader)["size"][0] in (398, 400)
-    every = 7  # frames of 2.5 ms, of which 60 per second are shown at most
+    every = 7  # frames of 2.5 ms; at most 60 per second are shown
     assert seen == [(0, 2), (1, 2)] and len(range(0, datasets.FRAMES, every)) == len(list(reader)) == 2
 
 

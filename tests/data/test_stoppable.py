@@ -1,4 +1,4 @@
-"""Work in a thread of its own that ends where the program does: nobody waits for what nobody needs."""
+"""Work in a separate thread that ends with the program, which does not wait for unneeded results."""
 
 import itertools
 import threading
@@ -18,11 +18,11 @@ from torch_mpm.data.generate import generate
 from torch_mpm.data.stoppable import StoppableExecutor, Stopped
 
 LONG = 20.0
-"""Time that work takes which is not stopped [s]."""
+"""Duration of work that is not stopped [s]."""
 
 
 class LongWork:
-    """Work that is at it, and whether it came to its end."""
+    """Work that records whether it has begun and whether it has ended."""
 
     def __init__(self):
         self.begun, self.ended = threading.Event(), False

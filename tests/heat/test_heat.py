@@ -280,7 +280,7 @@ def test_stefan_front(stefan):
 
 
 def test_a_step_without_heat_does_nothing_for_it():
-    """No op of heat, and with a temperature that nobody conducts the very same ops."""
+    """It runs no op of heat, and the same ops with a temperature that is not conducted."""
 
     state = block()
     step = mpm.Step(grid_around(), mpm.NeoHookean(E=1e3, nu=0.3), walls="slip")
@@ -316,7 +316,7 @@ def test_temperature_turns_with_a_body(device):
 
 
 class Dissipating(mpm.Material):
-    """Stress-free, and turns 7 J/m³ into heat in every step if that is asked for."""
+    """Law without stress that dissipates 7 J/m³ in every step where dissipation is recorded."""
 
     def update(self, state):
         fields = {"dissipated": torch.full_like(state.mass, 7.0)} if self.dissipation else {}

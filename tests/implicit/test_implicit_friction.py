@@ -206,7 +206,7 @@ def test_gradients_with_friction(dim, slides, device):
 
 
 def test_gradients_with_friction_in_float32(dim, device, one_thread):
-    """Against float64, of a block so stiff that rounding leaves more of a residual than is asked for."""
+    """Against float64, for a block so stiff that rounding leaves a residual above the tolerance."""
     grads = []
     for dtype in (torch.float64, torch.float32):
         grid, state = block(dim, device, dtype, lower=0.25)

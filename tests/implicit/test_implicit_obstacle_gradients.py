@@ -139,7 +139,7 @@ def test_gradients_in_float32(device):
 
 
 def test_gradients_of_a_state_do_not_depend_on_those_of_an_obstacle(device):
-    """Held components have an adjoint only where somebody asks for it."""
+    """Held components have an adjoint only where the obstacle requires grad."""
     grid, values = inputs(2, device)
     grads = []
     for wanted in (False, True):

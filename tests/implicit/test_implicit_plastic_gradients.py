@@ -206,7 +206,7 @@ def test_gradients_of_a_mixture(device):
 
 @pytest.mark.parametrize("plasticity", ["after", "inside"])
 def test_scenes_have_adjoints_of_their_own(plasticity, device):
-    """Scenes with their own dt and cohesion, of which one is so large that nothing flows, against each alone."""
+    """Scenes with their own dt and cohesion, the second so large that nothing flows, against each scene alone."""
     law = (mpm.QuarticSand, {"energy": "hencky"})
     grid, values = inputs(law, 2, device)
     pair = mpm.Grid(grid.dx, grid.lower, grid.upper, scenes=2)

@@ -44,7 +44,7 @@ def pulled(state, rate):
 
 
 def sheared(state):
-    """With deformations of some percent, some of which flow, and compressed on the whole."""
+    """State with deformations of a few percent, compressed on average; some particles flow."""
     generator = torch.Generator().manual_seed(0)
     P, dim = state.x.shape
     F = torch.eye(dim) * 0.97 + 0.03 * torch.randn(P, dim, dim, generator=generator)

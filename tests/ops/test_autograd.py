@@ -204,7 +204,7 @@ TWICE = {"Active", "NeoHookean", "CustomLaw", "WeaklyCompressible"}
 
 
 def rollout_case(name, device, every=None, n=2):
-    """Steps of a law with heat, gravity, a wall and a turning obstacle, of which every field is an input."""
+    """Steps of a law with heat, gravity, a wall and a rotating obstacle; all of their fields are inputs."""
     grid = mpm.Grid(0.1, (0, 0), (1, 1), deterministic=True)
     generator = torch.Generator().manual_seed(1)
     points = mpm.seed.box((0.3, 0.3), (0.6, 0.6), 0.1, per_cell=4)

@@ -70,7 +70,7 @@ def test_numbers_stand_for_all_rows(function, device):
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("function", NAMES)
 def test_gradients(function, dim, device):
-    """First and second derivatives by every argument, of which one is shared by all rows."""
+    """First and second derivatives by every argument; one argument is shared by all rows."""
     given = [a.requires_grad_() for a in arguments(function, dim, device, rows=3, seed=4)]
     if FUNCTIONS[function].arguments[-1] == (0, 0) and len(given) > 1:
         given[-1] = given[-1].detach()[0].clone().requires_grad_()

@@ -1,6 +1,7 @@
-"""What the ops check of their arguments, also where nobody has checked them before: `torch.ops.torch_mpm`.
+"""Argument checks of the raw ops, `torch.ops.torch_mpm`, which are also called without the checks in Python.
 
-A call that is not refused may end the process, so each test makes its calls in a child; the op named last did it.
+A call that is not rejected may crash the process, so each test makes its calls in a child process, which prints the
+name of each op first.
 """
 
 import math

@@ -153,7 +153,7 @@ LAWS = {
 
 
 def deformed(law, dim, device, dtype, scenes=3):
-    """Particles of which some flow, and some have turned inside out."""
+    """Particles, some flowing and some inverted."""
     given = particles(dim, scenes, device, dtype)["state"]
     random = torch.Generator().manual_seed(2)
     F = torch.eye(dim, dtype=F64) + 0.15 * torch.randn(len(given), dim, dim, generator=random, dtype=F64)
@@ -166,7 +166,7 @@ def deformed(law, dim, device, dtype, scenes=3):
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
 @pytest.mark.parametrize("name", LAWS)
 def test_figures_of_a_law(name, dim, dtype, device):
-    """All at once are those of the law's own functions, also of what flows, is inside out or has functions."""
+    """Values of one op equal those of the law's methods, also for flow, inversion and parameters that are functions."""
     law = LAWS[name]()
     state = deformed(law, dim, device, dtype)
     with torch.no_grad():
@@ -193,7 +193,7 @@ def test_figures_of_a_mixture(dim, dtype, device):
 
 
 def test_figures_of_what_a_law_adds(device):
-    """A law that changes its stress is asked itself."""
+    """The methods of a subclass are used where it overrides one."""
 
     class Harder(mpm.NeoHookean):
         def stiffness(self, state):

@@ -454,7 +454,7 @@ def test_a_video_that_is_interrupted_at_its_end_leaves_nothing(tmp_path, monkeyp
 
 
 def test_a_video_that_is_interrupted_at_its_begin_leaves_nothing(tmp_path, monkeypatch):
-    """Also while its encoder starts, which nobody could end."""
+    """The same while its encoder starts, before the writer can end it."""
     started = []
 
     class Interrupted(subprocess.Popen):

@@ -37,7 +37,7 @@ def test_the_number_of_substeps_is_told(tmp_path, capsys):
 
 @pytest.mark.parametrize("together", [False, True])
 def test_many_bodies(together):
-    """A thousand bodies, apart or all in one place: each is compared with its neighbours alone, and told of once."""
+    """A thousand bodies, apart or all in one place: each is compared with its neighbours only, and reported once."""
     n, side = 1000, 32
     bodies = [
         {

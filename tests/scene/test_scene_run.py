@@ -299,7 +299,7 @@ def killed_and_resumed(tmp_path, kills, duration, delay):
 
 
 def wait_for_frames(folder, frames, process):
-    """Until so many frames are whole or the process ends."""
+    """Wait until `frames` frames are complete or the process ends."""
     while process.poll() is None:
         try:
             with Trajectory(folder) as read:
@@ -542,7 +542,7 @@ def test_segments_stay_short_while_the_limit_changes(tmp_path, long_segments, mo
 
 
 def test_a_device_is_waited_for_once_per_segment(tmp_path, long_segments, monkeypatch):
-    """The frame at its end is asked for with its survey."""
+    """The frame at the end of a segment is copied together with its survey."""
     waits, on_host = [], module.on_host
     monkeypatch.setattr(module, "on_host", lambda tensors: waits.append(list(tensors)) or on_host(tensors))
     _, data, _ = simulate(tmp_path / "out", **STEADY)
