@@ -70,7 +70,7 @@ WITH_ENERGY = (*PLASTIC, "neo_hookean", "fluid", "viscous_fluid", "fixed_corotat
 
 @dataclasses.dataclass(frozen=True)
 class Combination:
-    """What one seed draws; `text` is how a failure is found again."""
+    """Draw of one seed; `text` reproduces a failure."""
 
     seed: int
     law: str

@@ -1,4 +1,4 @@
-"""What several tests share: errors and tolerances, random particles and nodes, small scenes, programs."""
+"""Helpers of several tests: errors and tolerances, random particles and nodes, small scenes, programs."""
 
 import copy
 import dataclasses

@@ -98,7 +98,7 @@ KINDS = {
     "obstacle": {"boundaries": [mpm.Sphere((0.4, 0.1), 0.2, velocity=(0.5, 0.5))]},
     "path": {"boundaries": [mpm.Sphere(lambda t: torch.stack([0.4 + 0.5 * t, 0.1 + 0.5 * t], -1), 0.2)]},
 }
-"""Of steps: those of one op, and others."""
+"""Options of steps, computed in one op or one by one."""
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -142,7 +142,7 @@ def test_gradients_of_a_scene_do_not_depend_on_the_scenes_beside_it(device):
 @pytest.mark.parametrize("law", [mpm.NeoHookean, mpm.FixedCorotated, mpm.QuarticSand])
 @pytest.mark.parametrize("transfer", ["apic", "pic", "flip"])
 def test_momentum_is_that_of_gravity_however_long_the_steps_are(law, transfer, device):
-    """Of free flight, to rounding."""
+    """Free flight: momentum equals that of gravity to rounding."""
     gravity = torch.tensor([[0.0, -9.8], [0.0, 0.0], [3.0, 1.0]], dtype=F64, device=device)
     step = step_of(2, STIFFNESS, scenes=3, device=device, law=law, gravity=gravity, transfer=transfer)
     state = batch(device, 2)
@@ -262,7 +262,7 @@ def test_times_that_are_not_finite(device):
 
 
 def test_limits_that_shrink_are_told(device):
-    """What falls has become fast within a segment, whose dt was chosen at rest."""
+    """The body accelerates within a segment; its dt was chosen at rest."""
     often, seldom = (
         mpm.rollout_to(step_of(2, 1e5, gravity=(0.0, -300.0)), blob(device, 2, F64), 0.03, every=every)
         for every in (1, 64)
@@ -294,7 +294,7 @@ def test_a_scene_that_is_lost_arrives_and_is_told(device):
 
 
 def test_calls_that_follow_one_another_keep_their_dt(device):
-    """Of scenes whose limits change by less than half, at ends that are no multiples of it."""
+    """Scenes with limits that change by less than half; end times are no multiples of dt."""
     step, state = step_of(2, STIFFNESS, scenes=3, device=device, gravity=None), batch(device, 2)
     bounds, dt = [], None
     with torch.no_grad():

@@ -1,4 +1,4 @@
-"""What setup.py builds on which machine."""
+"""Targets that setup.py builds, by machine."""
 
 from pathlib import Path
 

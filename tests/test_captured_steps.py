@@ -24,7 +24,7 @@ DT = 2e-4
 
 
 class Repeated(captured_steps.Graphs):
-    """What a replay does: arguments and results have their places, and a backward pass spoils what it has read."""
+    """Imitation of a replay: arguments and results have fixed memory, and a backward pass overwrites its inputs."""
 
     def record(self, beside):
         with uncounted(self._steps.step), torch.random.fork_rng([]):
@@ -189,7 +189,7 @@ def in_graphs_of(graph, **options):
 
 @pytest.mark.parametrize("make", MAKERS)
 def test_values_and_gradients_are_those_of_single_steps(make, device, recorded):
-    """Of three segments and a rest, in a loop that changes state and parameters; the status counts each step once."""
+    """Three segments and a remainder, in a loop that changes state and parameters; the status counts each step once."""
     step, state = make(device)
     again = make(device)[0]
     for k in range(3):
@@ -270,7 +270,7 @@ def test_random_numbers_are_those_of_the_first_time(device, recorded):
 
 
 def test_a_backward_pass_after_other_calls(device, recorded):
-    """Whose graphs have another state, and other particles, by then."""
+    """Graphs contain another state, and other particles, by then."""
     step, state = learned(device)
     starts = [state.replace(v=(k * state.v).requires_grad_()) for k in (1.0, 3.0)]
     ends = [mpm.rollout(step, start, 4, DT, graph=4) for start in starts]
@@ -382,7 +382,7 @@ def test_materials_and_order_by_content(device, recorded):
 
 
 def test_states_are_not_kept(device, recorded):
-    """Nor what they follow from, as a first rollout of a long training would."""
+    """Neither states nor their history are stored, as after the first rollout of a long training."""
     step, state = learned(device)
     v = state.v.clone().requires_grad_()
     middle = mpm.rollout(step, state.replace(v=v), 2, DT)
@@ -454,7 +454,7 @@ class OwnLaw(mpm.NeoHookean):
 
 
 class Target(nn.Module):
-    """Of the user's, with a tensor that is no buffer."""
+    """User module with a tensor that is no buffer."""
 
     def __init__(self, device):
         super().__init__()
@@ -477,7 +477,7 @@ ASSIGNED = {
 
 @pytest.mark.parametrize("what", ASSIGNED)
 def test_what_is_assigned_is_recorded_anew(what, device, recorded):
-    """Of classes made of the library's too, of objects that it keeps, and tensors of the user's."""
+    """Attributes of subclasses too, of objects that the step stores, and tensors of the user."""
 
     def make():
         ball = mpm.Sphere((0.5, 0.2), 0.15, velocity=(0.0, 4.0))

@@ -1,4 +1,4 @@
-"""What a rollout keeps for its backward pass: gradients are those without, and memory is what was said."""
+"""Stored states of rollouts: gradients equal those without checkpoints, and memory equals the estimate."""
 
 import math
 
@@ -256,7 +256,7 @@ def test_wrong_checkpoints():
 
 
 def kept_bytes(run):
-    """Of what autograd keeps of a computation."""
+    """Bytes that autograd stores for a computation."""
     kept = {}
 
     def pack(t):
@@ -313,7 +313,7 @@ def test_an_estimate_of_a_rollout_in_one_op_is_what_the_allocator_gives(kept, de
 @pytest.mark.parametrize("kept", [2, mpm.Checkpoints(states=2), 1])
 @pytest.mark.parametrize("law", ["elastic", "history"])
 def test_compiled_steps_that_were_never_called(kept, law, device):
-    """What a step makes at its first call, and keeps, is no part of what is called again."""
+    """Objects that a step creates and caches at its first call are no part of the recomputation."""
     laws = {"elastic": mpm.NeoHookean(E=1e4, nu=0.3), "history": mpm.VonMises(E=1e4, nu=0.3, yield_stress=10.0)}
     grid = mpm.Grid(dx=0.1, lower=(0.0, 0.0), upper=(1.0, 1.0), max_blocks=25)
     points = mpm.seed.box((0.3, 0.3), (0.5, 0.5), grid, per_cell=4)

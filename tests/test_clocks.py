@@ -105,7 +105,7 @@ FORMS = {
     "[B]": lambda dt, x: x.new_full((2,), dt),
     "[B] in float64": lambda dt, x: x.new_full((2,), dt, dtype=F64),
 }
-"""Of dt."""
+"""Forms of dt."""
 TIMES = {
     "number": lambda x: START,
     "[1]": lambda x: x.new_full((1,), START, dtype=F64),

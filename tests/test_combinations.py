@@ -1,4 +1,4 @@
-"""What must hold for every simulation, on random combinations of everything with everything (`combinations.draw`).
+"""Properties of every simulation, on random combinations of all options (`combinations.draw`).
 
 `COMBINATIONS=2000 pytest tests/test_combinations.py` runs more of them than the quick suite; a failing test names the
 seed that makes its combination again.

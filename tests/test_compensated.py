@@ -14,7 +14,7 @@ STEEL = {"E": 2e11, "nu": 0.3}
 DT = 1e-7
 """About a tenth of the stability limit of steel in cells of 1/20 m [s]."""
 SPEED = 0.01
-"""Of a block that moves by 1e-9 m in a step [m/s]: half a unit in the last place of 0.5 is 3e-8."""
+"""Speed of the block [m/s]: 1e-9 m per step, where half a unit in the last place of 0.5 is 3e-8 m."""
 
 
 def block(dim, dtype, offset=0.0, device="cpu", law=None, **options):

@@ -1,4 +1,4 @@
-"""What is handed out: the source distribution, the metadata and the licence of the packages."""
+"""Distributed packages: source distribution, metadata and licence."""
 
 import hashlib
 import json

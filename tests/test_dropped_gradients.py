@@ -1,4 +1,4 @@
-"""What requires a gradient and cannot have one is refused by name."""
+"""Errors for arguments that require grad and cannot have one; they name the argument."""
 
 from collections.abc import Callable
 from typing import Any

@@ -125,7 +125,7 @@ def test_a_lost_scene_is_frozen_told_of_and_reset(device):
 
 
 def test_clocks_of_heat(device):
-    """What depends on the time gets that of each scene."""
+    """Functions of time receive the time of each scene."""
     seen = []
     flux = mpm.heat_boundaries.Flux(mpm.heat_boundaries.FreeSurface(), lambda time: seen.append(time) or 0.0 * time)
     step = step_of(2, device)

@@ -46,7 +46,7 @@ def _scene(path):
 
 
 def _body(path):
-    """Of a mesh or of points, whose file is read for the fingerprint of a run."""
+    """Body of a mesh or of points; its file is read for the fingerprint of a run."""
     from torch_mpm.scene import Scene
 
     body = {"shape": "mesh" if path.suffix == ".obj" else "points", "file": path.name, "material": "m"}

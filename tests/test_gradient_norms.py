@@ -128,7 +128,7 @@ def test_a_record_begins_anew_and_needs_a_backward_pass(device):
 
 
 def test_norms_of_scenes_with_time_steps_of_their_own(device):
-    """Of a paused scene too, whose gradient stays as it is."""
+    """The gradient of a paused scene passes unchanged."""
     step, state, norms = make("in one op"), batch(device), mpm.GradientNorms(every=4)
     dt = torch.tensor([1e-3, 0.0, 1e-3], dtype=torch.float64, device=device)
     v = state.v.clone().requires_grad_()

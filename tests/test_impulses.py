@@ -40,7 +40,7 @@ def momentum(state: mpm.State, grid: mpm.Grid) -> tuple[Tensor, Tensor]:
 
 
 def gains(step: mpm.Step, state: mpm.State, n: int) -> tuple[Tensor, Tensor]:
-    """What gravity gives in n steps: impulse and moment [B, ...]."""
+    """Impulse and moment of gravity in n steps [B, ...]."""
     linear = angular = torch.zeros(())
     g = torch.tensor(step.gravity, dtype=F64).to(state.x)
     for _ in range(n):
@@ -140,7 +140,7 @@ def test_contact_impulses_are_what_nodes_lose(device, dim, per_scene):
 
 
 def test_a_mirror_takes_the_normal_component(device, dim):
-    """What its nodes exchange along the wall stays among them; that is only seen in the moment."""
+    """Nodes exchange momentum along the wall without a sum; only the moment changes."""
     blocks = random_blocks(grid_of(dim), device, share=1.0)
     nodes = random_nodes(blocks)
     walls = mpm.Walls([("mirror", "open"), *["open"] * (dim - 1)])

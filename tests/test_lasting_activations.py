@@ -78,7 +78,7 @@ def test_a_particle_that_is_much_faster_than_the_others(cells, dim):
 
 @torch.no_grad()
 def test_no_room_for_blocks_around(dim):
-    """Of particles far apart the blocks around are many times those that they touch: there is no room for them all."""
+    """Distant particles have many more neighbouring blocks than touched ones, too many for the pool."""
     g = torch.Generator().manual_seed(4)
     grid = mpm.Grid(dx=1 / 128, lower=(0.0,) * dim, upper=(1.0,) * dim, max_blocks=120)
     x = 0.1 + 0.8 * torch.rand(100, dim, generator=g, dtype=F64)

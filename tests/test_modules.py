@@ -155,7 +155,7 @@ def test_a_function_of_time_with_parameters(device):
 
 
 def test_parameters_of_heat(device):
-    """Those of its boundaries, of their surfaces and of the obstacles in them."""
+    """Parameters of its boundaries, of their surfaces and of the obstacles in them."""
     grid, state = block(device)
     where = {"dtype": torch.float64, "device": device}
     flux = nn.Parameter(torch.tensor(1e4, **where))

@@ -29,7 +29,7 @@ def few(monkeypatch):
 
 @pytest.fixture
 def sorts(monkeypatch) -> list[mpm.State]:
-    """What was sorted."""
+    """Arguments of all calls of `State.sorted`."""
     seen: list[mpm.State] = []
     whole = mpm.State.sorted
     monkeypatch.setattr(mpm.State, "sorted", lambda state, grid: seen.append(state) or whole(state, grid))

@@ -48,7 +48,7 @@ MAKES: dict[str, tuple[Callable[..., mpm.Material], dict[str, float]]] = {
     "active": (lambda E: mpm.Active(mpm.NeoHookean(E, 0.3), (1.0, 0.0)), {"E": 1e4}),
     "mixture": (lambda E: mpm.Mixture([mpm.Hencky(**SOLID), mpm.NeoHookean(E, 0.3)]), {"E": 1e4}),
 }  # fmt: skip
-"""What makes each law, and numbers for its parameters."""
+"""Constructor of each law, and values of its parameters."""
 PARAMETERS = [(law, name) for law, (_, given) in MAKES.items() for name in given]
 
 
@@ -97,7 +97,7 @@ WAYS: dict[str, Callable[[mpm.Grid, mpm.Material, mpm.State], Any]] = {
 
 @pytest.mark.parametrize(("law", "name"), PARAMETERS)
 def test_other_lengths_are_errors(law: str, name: str, device: str) -> None:
-    """Of every parameter of every law, however it is used, also in the first use of a state."""
+    """Every parameter of every law, in all uses, also in the first use of a state."""
     for use, n in zip(WAYS.values(), itertools.cycle(WRONG)):
         made = law_with(law, name, values(law, name, n, device))
         with pytest.raises(ValueError, match=rf"^{name} must have shape .*got \[{n}\] with B = {B}$"):
@@ -130,7 +130,7 @@ def test_scenes_and_particles_have_their_own_values(law: str, name: str, device:
 
 @pytest.mark.parametrize(("law", "name"), [p for p in PARAMETERS if p[1] not in ("coefficient", "exponent")])
 def test_gradients_have_the_shape_of_their_parameter(law: str, name: str, device: str) -> None:
-    """Those of values that particles share are the sums of those of the particles."""
+    """Gradients of shared values are the sums over the particles."""
     state = batch(device)
 
     def gradient(value: Tensor) -> Tensor:
@@ -216,7 +216,7 @@ def test_parameters_that_are_assigned_are_checked(device: str) -> None:
 
 
 def test_laws_without_particles_are_checked(device: str) -> None:
-    """Of a mixture, and the values per material of a parameter."""
+    """Laws of a mixture, and values of a parameter per material."""
     state = batch(device).replace(material=torch.zeros(P, dtype=torch.int32, device=device))
     wrong = torch.full((2,), 1e4, device=device)
     idle = mpm.Mixture([mpm.Hencky(**SOLID), mpm.NeoHookean(E=wrong, nu=0.3)])

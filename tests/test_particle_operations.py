@@ -1,4 +1,4 @@
-"""What acts on particles before P2G: momentum that pushes bring, held and absent particles, and where they stand."""
+"""Operations on particles before P2G: momentum of pushes, held and absent particles, and positions."""
 
 import pytest
 import torch

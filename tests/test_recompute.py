@@ -10,7 +10,7 @@ from torch_mpm.recompute import called_again
 
 F64 = torch.float64
 WEIGHT = torch.linspace(0.5, 1.5, 9, dtype=F64).reshape(3, 3).requires_grad_()
-"""That a function has from around it, and not as an argument."""
+"""Tensor of a closure, not an argument."""
 
 
 def layered(x, y):
@@ -135,6 +135,6 @@ print([name for name in sys.modules if name.startswith("torch._dynamo")])
 
 
 def test_no_compiler_is_imported():
-    """That took the first rollout with checkpoints seconds."""
+    """An import would delay the first rollout with checkpoints by seconds."""
     done = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

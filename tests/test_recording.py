@@ -117,7 +117,7 @@ def test_wrong_arguments():
 @pytest.mark.parametrize("time", [0.5, torch.tensor([0.5]), torch.tensor([0.5, 0.25])])
 @pytest.mark.parametrize("n", [0, 4])
 def test_times_of_frames(dt, time, n, device):
-    """Of the start too, which may be a number where dt is a tensor."""
+    """Including the time of the start, which may be a number where dt is a tensor."""
     dt, time = (t.to(device) if isinstance(t, torch.Tensor) else t for t in (dt, time))
     step = mpm.Step(box(2, scenes=2), mpm.NeoHookean(E=1e4, nu=0.3))
     state = mpm.State.concatenate([blob(device, 2, 20)] * 2, scene=True).replace(time=time)

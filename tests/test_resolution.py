@@ -62,7 +62,7 @@ def test_points_that_were_changed_are_taken_as_they_are():
 
 @pytest.mark.parametrize("dtype", [FLOAT, DOUBLE])
 def test_points_relative_to_an_origin_are_those_at_zero(dtype, dim, tmp_path):
-    """Of every shape, a mesh and a file in coordinates of a map, up to the rounding of these in float64."""
+    """All shapes, a mesh and a file in map coordinates, up to their rounding in float64."""
     near, far = places((0, 0, 0), dim), places(UTM, dim)
     origin = torch.tensor(UTM[:dim], dtype=DOUBLE)
     options = {"grid": 0.1, "per_cell": 2**dim, "dtype": dtype}

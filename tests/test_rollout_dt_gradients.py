@@ -10,11 +10,11 @@ import torch_mpm as mpm
 
 DT, STEPS = 1e-4, 6
 LAWS = ["neo_hookean", "fluid", "von_mises", "herschel_bulkley", "viscoelastic", "sand"]
-"""Of F and J, that flow, and whose flow takes time."""
+"""Laws of F and of J, plastic and viscoplastic ones."""
 
 
 def case(law: str, dim: int, device: str, scenes: int = 1, **options) -> tuple[mpm.Step, mpm.State]:
-    """With an obstacle at rest, a wall, and gravity that has a gradient too."""
+    """Case with an obstacle at rest, a wall, and gravity that requires grad."""
     gravity = torch.randn(scenes, dim, dtype=F64, device=device).requires_grad_()
     floor = mpm.Plane((0.0, 0.35, 0.0)[:dim], (0.1, 1.0, 0.0)[:dim], "separate", friction=0.2)
     step = mpm.Step(
@@ -25,7 +25,7 @@ def case(law: str, dim: int, device: str, scenes: int = 1, **options) -> tuple[m
 
 
 def by_dt(step: mpm.Step, end: mpm.State, dt: Tensor) -> dict[str, Tensor | None]:
-    """Of what the state becomes, and when."""
+    """Gradients of a loss of the end state and its time."""
     total = loss(end.replace(time=0.0)) + (1e3 * end.time).square().sum()
     return dict(zip(("dt", "gravity"), torch.autograd.grad(total, [dt, step.gravity]), strict=True))
 

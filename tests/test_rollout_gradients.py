@@ -51,7 +51,7 @@ def pulled(dim: int, dtype: torch.dtype = F64) -> Tensor:
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_random_simulations(seed, device):
-    """Those that go another way too, with the reason why."""
+    """Simulations that are not computed in one op are included, with the reason."""
     case = make(draw(seed), device)
     case.step.heat = None
     state = case.step.prepare(case.state)
@@ -377,7 +377,7 @@ def test_gradients_of_scenes_with_time_steps_of_their_own(transfer, device):
 
 
 def raw_arguments(device: str) -> list:
-    """Of `substeps`: two laws, walls, an obstacle and gravity in two scenes."""
+    """Arguments of `substeps`: two laws, walls, an obstacle and gravity in two scenes."""
     state, D = blob(device, 2, 40), 2
     g = torch.Generator().manual_seed(2)
     scene, material = (torch.arange(40) % 2).int().to(device), (torch.arange(40) // 2 % 2).int().to(device)

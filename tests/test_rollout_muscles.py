@@ -15,7 +15,7 @@ SOLIDS = [name for name in LAWS_HERE if name != "fluid"]
 
 
 def fibres(dim: int, device: str, count: int = 300, dtype: torch.dtype = F64) -> Tensor:
-    """Of each particle, some without."""
+    """Fibre directions of particles; zero for every fifth."""
     d = torch.nn.functional.normalize(torch.randn(count, dim, dtype=F64), dim=1)
     d[::5] = 0
     return d.to(device, dtype)

@@ -35,7 +35,7 @@ def smooth(dim: int, device: str):
 
 
 def branching(dim: int, device: str):
-    """Which looks at the time, so that it cannot be mapped over many of them."""
+    """Path that branches on the time, so that it cannot be mapped over several times."""
 
     def path(t: Tensor) -> Tensor:
         return torch.stack(swinging(t)[:dim], -1) if float(t.max()) < 5e-4 else torch.stack([0.5 + 0 * t] * dim, -1)
@@ -124,7 +124,7 @@ def test_paths_in_small_scenes(clocks, deterministic, dim, device):
 @torch.no_grad()
 @pytest.mark.cuda
 def test_paths_among_many_particles():
-    """Whose G2P and next P2G are one kernel."""
+    """G2P and the next P2G are one kernel here."""
     state = blob("cuda", 3, 2**18, torch.float32)
     step = mpm.Step(box(3, 1 / 40), mpm.NeoHookean(E=1e3, nu=0.3), boundaries=bodies(3, smooth(3, "cuda")))
     assert in_one_op(step, state)
@@ -163,7 +163,7 @@ def test_what_a_path_raises_is_raised(device):
 
 
 class Plain(mpm.Sphere):
-    """Of torch operations, since it has a `forward` of its own."""
+    """Obstacle evaluated by torch operations, since it overrides `forward`."""
 
     def forward(self, *arguments):
         return super().forward(*arguments)
@@ -235,7 +235,7 @@ def test_a_path_has_no_gradient_where_the_obstacle_is_not(device):
 
 @torch.no_grad()
 def test_clocks_of_float32_are_those_of_single_steps(device):
-    """Which lose digits at late times: position, turn and start of an obstacle are of one time."""
+    """They lose digits at late times: position, rotation and start of an obstacle use the same time."""
     state = blob(device, 2, dtype=torch.float32)
     state = state.replace(time=torch.full((1,), 8.0, device=device), v=0.01 * state.v)
     ball = mpm.Box(lambda t: torch.stack([0.3 + 20 * (t - 8), 0.5 + 0 * t], -1), (0.2, 0.3), angular_velocity=3.0)
@@ -261,7 +261,7 @@ print([name for name in ("sympy", "torch._dynamo") if name in sys.modules])
 
 
 def test_no_compiler_is_imported():
-    """Which takes two seconds: torch.broadcast_shapes and forward derivatives do so."""
+    """The import takes two seconds; torch.broadcast_shapes and forward derivatives cause it."""
     done = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 
@@ -301,7 +301,7 @@ def test_gradients_of_obstacles(every, transfer, dim, device):
 
 @pytest.mark.parametrize("with_impulse", [False, True])
 def test_gradients_of_obstacles_of_scenes(with_impulse, dim, device):
-    """Of parameters that all scenes share, and of some that each has; with the gradient of impulses, too."""
+    """Gradients of shared parameters and of parameters per scene, also through impulses."""
     scenes = 3
     shared, own = trained(dim, device)
     own.position = torch.nn.Parameter(0.36 + 0.02 * torch.rand(scenes, dim, dtype=F64, device=device))

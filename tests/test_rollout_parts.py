@@ -92,7 +92,7 @@ def test_hooks_act_and_are_called_in_the_prefix_too(device):
 
 
 def test_a_control_keeps_its_gradient_and_is_not_cut_with_the_state(device):
-    """What a hook gives to a state passes the cuts where steps leave it alone; a state at a cut is refused."""
+    """Fields from a hook pass the cuts if steps do not change them; a new state at a cut raises an error."""
     step, state = make("from Python", device)
     strength = torch.tensor(3.0, dtype=torch.float64, device=device, requires_grad=True)
     step.on_particles = lambda now, dt: now.replace(v=now.v + dt * now.extra["push"])

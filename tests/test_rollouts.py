@@ -316,7 +316,7 @@ def test_a_full_pool_is_an_error_and_nothing_is_lost():
 
 
 def test_a_domain_of_many_blocks_changes_nothing(device):
-    """Which is activated by parts of its table; blocks come and go, and a particle is lost."""
+    """Activation processes its table in parts; blocks become active and inactive, and a particle is lost."""
     state, dt = flying(device)
     x = state.x.clone()
     x[7] = float("nan")

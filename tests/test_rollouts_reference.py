@@ -36,7 +36,7 @@ def mapped(name: str, state: dict[str, Tensor]) -> tuple[dict[str, Tensor], Tens
 
 
 def after_contact(blocks, velocity: Tensor, time: float) -> Tensor:
-    """Of a sphere with friction that moves along the first axis."""
+    """Velocities after contact with a sphere with friction that moves along the first axis."""
     rows = blocks.active_nodes().nonzero()[:, 0]
     grid = blocks.grid
     x = (blocks.node_indices()[rows].double() - PADDING) * grid.dx + torch.tensor(

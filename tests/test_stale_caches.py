@@ -1,4 +1,4 @@
-"""What steps keep from call to call: each thing that is kept, changed in each way that Python and torch offer."""
+"""Caches of steps between calls: each cached object is changed in each way that Python and torch offer."""
 
 import copy
 from collections.abc import Callable
@@ -289,7 +289,7 @@ def test_assigned_kinds_of_walls(device):
 
 
 def test_whole_numbers_of_a_law():
-    """That are no floats."""
+    """Integers and float32 numbers are accepted like floats."""
     law = mpm.NeoHookean(E=1e5, nu=0.3)
     step, state = mpm.Step(GRID, law), start("cpu")
     for E in (100000, np.float32(1e4), 1000):

@@ -240,7 +240,7 @@ def test_recording_changes_no_result(device, dim, law):
     "law", [mpm.NeoHookean(E=1e4, nu=0.3), mpm.FixedCorotated(E=1e4, nu=0.3), mpm.QuarticSand(E=1e4, nu=0.3)]
 )
 def test_a_step_can_be_recorded_after_inference(device, dim, law):
-    """What a step keeps from one call to the next may be made in inference mode and be saved for a gradient later."""
+    """Cached tensors of a step may be created in inference mode and be saved for a gradient later."""
     grid = mpm.Grid(0.1, (0,) * dim, (1,) * dim)
     step = mpm.Step(grid, law, gravity=(0, -9.8, 0)[:dim], walls="slip")
     state = step.prepare(block_state(dim, device))

@@ -1,4 +1,4 @@
-"""What the ops take of an activation: packing, the rows of nodes, and particles in scenes that do not exist."""
+"""Inputs that ops accept from an activation: packing, rows of nodes, and particles in scenes that do not exist."""
 
 import dataclasses
 import resource

@@ -165,7 +165,7 @@ def test_vmap_is_refused_with_what_serves_instead(device):
     F = torch.eye(2, dtype=F64, device=device).expand(3, 2, 2)
     with pytest.raises(NotImplementedError, match=r"vmap over an isotropic function"):
         torch.vmap(lambda E: mpm.isotropic(F, lambda s: E * s.log()))(moduli)
-    # What the message says: parameters of scenes, whose gradients are those of each alone.
+    # The message recommends parameters per scene; their gradients equal those of each scene alone.
     by_scene = moduli.clone().requires_grad_()
     step = make_step(2, scenes=2, E=by_scene)
     end = mpm.rollout(step, mpm.State.concatenate([state, state], scene=True), 3, DT)
@@ -213,7 +213,7 @@ def test_training_is_the_same_from_a_seed(device):
 
 
 class Loss(nn.Module):
-    """What `DistributedDataParallel` wraps: a step, whose parameters it finds, and what is done with it."""
+    """Module for `DistributedDataParallel`: a step with its parameters, and a loss."""
 
     def __init__(self, scenes):
         super().__init__()

@@ -7,7 +7,7 @@ from cases.rollouts import blob, box
 import torch_mpm as mpm
 
 CYCLES = 3_000_000_000
-"""Of a GPU that is kept busy, more than a second."""
+"""Clock cycles that keep a GPU busy for more than a second."""
 
 
 def scene(kind: str, device: str) -> tuple[mpm.Step, mpm.State]:

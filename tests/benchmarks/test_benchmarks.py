@@ -227,7 +227,7 @@ def test_svd_program(tmp_path: Path) -> None:
 
 
 def test_memory_of_checkpoints_is_what_was_estimated() -> None:
-    """Of live tensors, counted apart; beside the estimate is what the backward pass of one step works with."""
+    """Memory of live tensors, counted separately; the excess is the working memory of one step's backward pass."""
     cases = {name: checkpoints.case("torch code", name, 4, 20, "cpu") for name in ("all steps", "5 states")}
     one_step = cases["all steps"]["estimated_memory"] / 20
     for case in cases.values():

@@ -16,7 +16,7 @@ RESULTS = (
     "Arrival", "Blocks", "DamagedFileError", "Failures", "Frames", "GridOverflowError", "HeatSolve", "Material",
     "FrontWarning", "PrecisionWarning", "RolloutEstimate", "SimulationError", "Trajectory",
 )  # fmt: skip
-"""What functions return or raise, and a base class."""
+"""Classes that functions return or raise, and a base class."""
 CUDA_ALONE = ("captured",)
 
 PROGRAM = """

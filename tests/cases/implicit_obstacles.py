@@ -6,7 +6,7 @@ import torch_mpm as mpm
 
 
 def parameters(dim, device):
-    """Of an obstacle that comes down on the block of `inputs` from above, turning."""
+    """Parameters of a rotating obstacle that moves down on the block of `inputs`."""
     turn = (0.1,) if dim == 2 else (0.1, 0.2, 0.3)
     given = {
         "position": (0.55, 0.57, 0.4)[:dim],

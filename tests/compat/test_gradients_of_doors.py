@@ -128,7 +128,7 @@ CALLS = {
         (),
     ),
 }
-"""Of each method its arguments, and those that have a gradient."""
+"""Arguments of each method, and those with a gradient."""
 ARGUMENTS = [(method, name) for method, (arguments, _) in CALLS.items() for name in arguments]
 
 

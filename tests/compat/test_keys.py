@@ -58,7 +58,7 @@ def test_all_problems_are_named_at_once():
 
 
 def test_keys_without_effect_are_accepted():
-    """Those that PhysGaussian itself puts among the parameters."""
+    """PhysGaussian itself writes these keys into its parameters."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         solver().set_parameters_dict(dict.fromkeys(table.WITHOUT_EFFECT, 0.5))

@@ -279,7 +279,7 @@ def test_a_scene_that_fails_is_tried_again_with_half_of_the_time_step(tmp_path):
 
 
 def test_what_is_packed_beside_the_simulation_is_the_same(device):
-    """Of scenes that failed at first, and of some with particles of obstacles."""
+    """Scenes that failed at first, and scenes with obstacle particles."""
     made = configuration(
         material__jelly__E={"choice": [1e4, 1.2e7]}, dt=1e-3, grid__deterministic=True,
         obstacle=[{"count": {"choice": [0, 1]}, "shape": "sphere", "center": [0.5, 0.1], "radius": 0.08}],

@@ -110,7 +110,7 @@ def test_files_of_a_run_are_those_of_a_process_while_they_are_written(tmp_path, 
 
 
 def test_termination_is_an_exception_of_commands(tmp_path, monkeypatch, capsys):
-    """What is being written is removed on the way out."""
+    """The file being written is removed."""
     path = datasets.make_dataset(tmp_path / "set")
     written = []
 

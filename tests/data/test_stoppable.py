@@ -81,7 +81,7 @@ def test_an_executor_without_work_is_stopped():
 
 
 def test_an_interrupt_does_not_wait_for_scenes_that_are_drawn(tmp_path, monkeypatch):
-    """What is there is kept, and nothing is left."""
+    """Finished shards remain, without temporary files."""
     work, numbers = LongWork(), itertools.count()
 
     def draw(*arguments):

@@ -31,7 +31,7 @@ def wall(x, temperature, side=1.0, dim=2):
 
 
 def stand_off(kernel, dx, shift, dim=2, gap=0.0):
-    """What the temperature of a bar with flux 1 at its far end exceeds the distance from the wall by, in dx."""
+    """Temperature of a bar with flux 1 at its far end, minus the distance from the wall, in dx."""
     state, distance = bar(dx, shift, dim)
     sides = torch.cartesian_prod(*[(torch.arange(4, dtype=FLOAT) + 0.5) * dx / 2] * (dim - 1)).reshape(-1, dim - 1)
     tip = torch.cat([torch.full((len(sides), 1), 1 + shift, dtype=FLOAT), sides], 1)

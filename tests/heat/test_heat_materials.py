@@ -172,7 +172,7 @@ def test_expansion_of_a_fluid_keeps_its_pressure_at_the_expanded_volume():
 
 
 def test_plastic_law_inside_expansion_and_melting():
-    """What the law returns for F_e comes back as F, and what it dissipates comes through, but not from what flows."""
+    """F_e from the law is returned as F, and its dissipation too, except for particles that flow."""
 
     class Returned(mpm.Material):
         def update(self, state):

@@ -131,7 +131,7 @@ def test_first_steps_conduct_as_later_ones(kernel, jitter):
 
 @pytest.mark.parametrize("transfer", ["hybrid", "apic"])
 def test_gradient_starts_from_the_grid(device, dim, transfer):
-    """That of a linear temperature, at the surface too; the same in a batch, alone, sorted, in a step, and as given."""
+    """Gradient of a linear temperature, also at the surface; equal in a batch, alone, sorted and in a step."""
     state = block(dim, device, n=8 if dim == 2 else 4)
     slope = torch.tensor([1.0, -2.0, 0.5][:dim], dtype=FLOAT, device=device)
     state = state.replace(temperature=3 + state.x @ slope)

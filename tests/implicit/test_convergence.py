@@ -23,7 +23,7 @@ def clamp(x, side):
 
 
 def cantilever_sag(E, layers, length=0.5, nu=0.3):
-    """Of Euler and Bernoulli, with the second moment of area of rows of particles."""
+    """Sag by Euler-Bernoulli theory, with the second moment of area of rows of particles."""
     rows = (torch.arange(layers, dtype=torch.float64) - (layers - 1) / 2) * DX / 2
     weight = DENSITY * G * layers * DX / 2
     return weight * length**4 * (1 - nu**2) / (8 * E * float(rows.square().sum()) * DX / 2)

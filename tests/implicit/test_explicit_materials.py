@@ -165,7 +165,7 @@ def test_a_solve_without_particles_and_one_without_others(device):
 
 
 def test_laws_without_an_energy_may_be_explicit(device):
-    """Which implicit steps do not take."""
+    """Implicit steps reject such laws otherwise."""
     grid, state = beside(2, device)
 
     def stress(F):
@@ -255,7 +255,7 @@ def test_parameters_per_particle_and_another_order(device):
 
 @pytest.mark.parametrize("explicit", [[1], [0, 1], [2]])
 def test_parameters_per_particle_of_several_materials(explicit, device):
-    """Of two and of one in the solve: against an explicit step, and two scenes against each alone."""
+    """Two materials or one in the solve: against an explicit step, and two scenes against each alone."""
     grid, state = beside(2, device)
     thirds = (torch.arange(len(state), device=device) % 3 == 2) & (state.material == SOLID)
     state = state.replace(material=torch.where(thirds, 2, state.material).int())
@@ -309,7 +309,7 @@ def end_of(grid, material, values, walls="slip", n=1, checkpoint=None, options=N
 
 
 def check_gradients(grid, material, values, names, limit=1e-6, **arguments):
-    """Of a random sum of the results along a random direction of each input, against central differences."""
+    """Compare derivatives of a random sum of the results along a random direction of each input with differences."""
     leaves = {name: values[name].clone().requires_grad_() for name in names}
     weights = {name: torch.randn_like(values[name]) for name in ("x", "v", "F", "J")}
 
@@ -395,7 +395,7 @@ def test_gradients_in_float32(device):
 
 
 def test_the_limit_is_that_of_the_explicit_materials(dim, device):
-    """That of these particles alone, however stiff the others are."""
+    """It equals the limit of these particles alone, at any stiffness of the others."""
     grid, state = beside(dim, device, corner=0.0)
     state = state.replace(v=0 * state.v, C=None, F=None, J=0 * state.mass + 1)
     law = mixture(E=1e9, K=1e4)

@@ -178,7 +178,7 @@ def sliding(dim, device, friction, mu, v):
 
 @pytest.mark.parametrize("slides", [True, False])
 def test_gradients_with_friction(dim, slides, device):
-    """Of stiffness, velocities and the coefficient, against differences; what sticks does not feel its coefficient."""
+    """Gradients by stiffness, velocities and coefficient against differences; none by the latter for sticking nodes."""
     _, state = block(dim, device, lower=0.25)
     torch.manual_seed(0)
     v = 0.02 * torch.randn(len(state), dim, dtype=torch.float64).to(device)
@@ -301,7 +301,7 @@ def test_a_block_slides_down_a_slope_that_is_oblique_to_the_lattice(
 
 @pytest.mark.parametrize(("degrees", "slope_dim"), [(10, 2), (24, 2), (38, 2), (24, 3)])
 def test_a_block_sticks_to_a_slope_that_is_oblique_to_the_lattice(degrees, slope_dim, device):
-    """What is held along and across its surface is at rest exactly, not but for rounding."""
+    """Nodes held along and normal to the surface have a velocity of exactly zero."""
     dim = slope_dim
     grid, state, slope, _ = oblique("plane", math.radians(degrees), 2.0, dim, "separate", device, torch.float64)
     nodes = {}

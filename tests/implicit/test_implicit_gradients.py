@@ -13,7 +13,7 @@ from torch_mpm.implicit import Implicit, equilibrium
 
 
 def check_gradients(grid, values, limit, names=NAMES, **arguments):
-    """Of a random sum of the results along a random direction of each input, against central differences."""
+    """Compare derivatives of a random sum of the results along a random direction of each input with differences."""
     leaves = {name: values[name].clone().requires_grad_() for name in names}
     weights = [torch.randn_like(values[name]) for name in ("x", "v", "F")]
 
@@ -98,7 +98,7 @@ def test_each_scene_has_its_own_adjoint(device):
 
 
 def test_memory_does_not_grow_with_the_iterations(device):
-    """What autograd keeps of a step that takes one iteration and of one that takes many."""
+    """Sizes that autograd saves for a step with one iteration and for one with many."""
     kept, iterations = [], []
     for tolerance in (0.5, 1e-12):
         grid, values = inputs(2, device)

@@ -94,7 +94,7 @@ def groups_of(law):
 
 
 def check_gradients(grid, values, law, groups, limit, **arguments):
-    """Of a random sum of the results, against central differences, along one random direction for each group."""
+    """Compare derivatives of a random sum of the results with differences, in one random direction per group."""
     weights = [torch.randn_like(values[name]) for name in ("x", "v", "F")]
     leaves = {name: values[name].clone().requires_grad_() for group in groups for name in group}
 
@@ -113,7 +113,7 @@ def check_gradients(grid, values, law, groups, limit, **arguments):
                 for h in (1e-5, -1e-5)
             ]
         difference = (ends[0] - ends[1]) / 2e-5
-        # What the difference has of the rounding of its ends: one unit in the last place of each.
+        # Rounding error of the difference: one unit in the last place of each of its ends.
         rounding = 2 * torch.finfo(loss.dtype).eps * float(loss.abs()) / 2e-5
         along = sum((grads[name] * d).sum() for name, d in directions.items())
         error = float((along - difference).abs())
@@ -270,7 +270,7 @@ def test_gradients_in_float32(law, plasticity, device):
 @pytest.mark.parametrize("plasticity", ["after", "inside"])
 @pytest.mark.parametrize("law", LAWS, ids=name_of)
 def test_gradients_are_finite_where_the_state_is(law, plasticity, device):
-    """Of material at rest, sheared, compressed, torn apart and turned inside out, which has no stress."""
+    """Material at rest, sheared, compressed, torn apart, and inverted (without stress)."""
     grid, values = inputs(law, 2, device)
     F = torch.eye(2).to(values["F"]).repeat(len(values["F"]), 1, 1)
     F[1, 0, 1], F[2, 0, 0], F[3, 1, 1], F[4, 0, 0], F[5, 0, 0] = 0.3, 0.8, 1.5, -1.0, 0.0
@@ -350,7 +350,7 @@ def test_trial_stress_is_that_of_the_energy(law, dim, device):
 
 
 def test_a_static_sag_beyond_yield(device):
-    """Of a column that its weight makes flow, with gradients by its strength, against differences."""
+    """Column that flows under its weight; gradients by its strength against differences."""
     grid = mpm.Grid(0.125, (0, 0), (1.5, 1.5))
     points = mpm.seed.box((0.5, 0.0), (0.75, 1.0), grid, per_cell=4)
     state = mpm.State.at_rest(points, density=1000.0, dtype=torch.float64, device=device)

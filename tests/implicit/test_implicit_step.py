@@ -216,7 +216,7 @@ def test_walls_hold_in_the_solve(kind, dim, device):
 
 
 def test_separate_lets_go(device):
-    """What flies off a separating floor feels nothing of it; a sliding one would hold it."""
+    """A body that leaves a separating floor has no force from it; a slip floor would hold it."""
     grid, state = bar(2, device, lower=0.0)
     state = state.replace(v=state.v + torch.tensor([0.0, 1.0], dtype=torch.float64, device=device))
     law = mpm.NeoHookean(E=1e5, nu=0.3)

@@ -1,4 +1,4 @@
-"""What `Step.explain` says of integrators: against measured times, and in plain cases."""
+"""Comparison of integrators by `Step.explain`: against measured times, and in simple cases."""
 
 import json
 import re

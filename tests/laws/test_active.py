@@ -37,7 +37,7 @@ def test_the_stress_is_that_of_the_energy(dim, device):
 
 
 def test_the_stiffness_bounds_that_of_automatic_differentiation(dim, device):
-    """Which is at most 1.32 times the tangent that it stands for."""
+    """The bound is at most 1.32 times the tangent."""
     state, law = stretched(dim, device), mpm.Active(passive(), (1.0,) + (0.0,) * (dim - 1))
     assert bool((1.4 * law.stiffness(state) >= mpm.Material.stiffness(law, state)).all())
     assert bool((law.wave_modulus(state) <= law.stiffness(state) + 1e-9).all())

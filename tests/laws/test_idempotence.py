@@ -127,7 +127,7 @@ def test_second_update_of_sand_changes_nothing(device, dim, dtype, energy, flow,
 
 
 def test_flow_at_a_rate_vanishes_with_the_time_step(device, dim):
-    """What a second update moves is of the order of dt."""
+    """The change by a second update is of the order of dt."""
     law, state = LAWS["viscoplastic_fluid"](), states(dim, torch.float64, device)
     changes = []
     for dt in (1e-8, 1e-9):

@@ -413,7 +413,7 @@ def test_heat_of_a_collapsing_column_is_the_energy_that_it_loses(device, energy,
 
 
 class Energies(NamedTuple):
-    """Of a motion [J]: heat and work of the stresses, elastic energy in the end, kinetic and potential energy lost."""
+    """Energies of a motion [J]: heat and work of stresses, final elastic energy, lost kinetic and potential energy."""
 
     heat: float
     work: float
@@ -589,7 +589,7 @@ def gradient_states(dim: int) -> Tensor:
 
 @pytest.mark.parametrize(("energy", "apex", "flow"), FORMS)
 def test_gradients(device, dim, energy, apex, flow):
-    """Of every result with respect to every argument."""
+    """Derivatives of every result by every argument."""
     h = gradient_states(dim)
     F = deformation(h).to(device)
     mu, lam, angle, cohesion, volume = (
@@ -717,7 +717,7 @@ def test_gradients_in_float32_of_a_loss_that_misses_the_stiff_axis(device, energ
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_gradients_of_parameters_and_scalar_results_in_float32(device, dtype):
-    """Of every input through every result, at states of every branch, against float64; nothing is lost on the way."""
+    """Gradients of every result by every input, at states of every branch, against float64; none underflows."""
     count = 2000
     F = deformation(0.05 * torch.randn(count, 3, dtype=torch.float64) - 0.02)
     inputs = [F, *(torch.full((count,), v) for v in (1.3, 1.9, 0.3, 1e-3)), 1e-3 * torch.rand(count)]

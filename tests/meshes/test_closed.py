@@ -109,7 +109,7 @@ BODIES = {
 
 @pytest.mark.parametrize("name", BODIES)
 def test_the_mass_is_that_of_the_filled_places(name):
-    """Of cubes whose sides lie between points of the lattice; both by hand."""
+    """Cubes with sides between points of the lattice, against a mass computed by hand."""
     make, right, message = BODIES[name]
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)

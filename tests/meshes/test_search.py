@@ -1,4 +1,4 @@
-"""What search trees find, against every triangle: inside or outside, nearest point, distance and gradients."""
+"""Search trees, against a loop over all triangles: inside or outside, nearest point, distance and gradients."""
 
 import numpy as np
 import pytest

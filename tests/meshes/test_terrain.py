@@ -38,7 +38,7 @@ def placed(axis, level, kind):
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @pytest.mark.parametrize("level", [-0.5, 0.75])
 def test_volume_places_and_distance(kind, axis, level):
-    """Of a sloping plane: the volume is area times the mean height from the level, by hand."""
+    """Sloping plane: the expected volume is area times mean height above the level."""
     body = placed(axis, level, kind)
     area, middle = 0.8 * 0.6, height(0.0, 0.5)
     assert body.volume(3) == pytest.approx(area * abs(middle - level), rel=1e-12)

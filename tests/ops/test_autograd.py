@@ -46,7 +46,7 @@ class Case:
         return sum((torch.randn(g.shape, generator=generator, dtype=torch.float64).to(g) * g).sum() for g in grads)
 
     def second(self, function=None):
-        """Of the inputs that a gradient depends on; None for the others."""
+        """Second derivatives by the inputs that a gradient depends on; None for the others."""
         leaves = self.leaves()
         grads = torch.autograd.grad(self.loss(*leaves, function=function), leaves, create_graph=True)
         return torch.autograd.grad(self.projected(grads), leaves, allow_unused=True)

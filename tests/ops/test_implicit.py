@@ -163,7 +163,7 @@ class Case:
         return value.to(self.mass)
 
     def inverse(self) -> Tensor:
-        """Of the node blocks, zero without mass."""
+        """Inverse node blocks, zero without mass."""
         blocks = self.mass[:, None, None] * torch.eye(self.dim).to(self.mass)
         blocks = blocks + ops.implicit_node_blocks(self.blocks, self.particles.x, self.tangent, "mls")
         there = (self.mass > 0)[:, None, None]

@@ -139,7 +139,7 @@ def test_third_derivatives_are_refused(device):
 
 
 def test_melting_point_that_is_infinite(device):
-    """What never melts keeps its temperature, and its gradients are finite."""
+    """The temperature does not change then, and its gradients are finite."""
     given = [a.requires_grad_() for a in arguments("heat_melt", 3, device)]
     with torch.no_grad():
         given[1].zero_()
@@ -188,7 +188,7 @@ def test_on_the_switches(device):
 
 @pytest.mark.parametrize("dtype,bound", [(torch.float64, 1e-14), (torch.float32, 1e-6)])
 def test_volumes_far_from_one(dim, dtype, bound, device):
-    """What flows keeps its volume, from 1e-30 to 1e30."""
+    """Flow conserves the volume, from 1e-30 to 1e30."""
     J = torch.logspace(-30, 30, 61, dtype=dtype, device=device)
     _, F = pointwise("melting_parts", dim, J, 1.0, 1.0, 0.8)
     assert float((F[:, 0, 0].double() ** dim / J.double() - 1).abs().max()) < 10 * bound

@@ -19,7 +19,7 @@ def deformation(scale: float) -> Tensor:
 
 
 def stress(F: Tensor) -> Tensor:
-    """Of a neo-Hookean solid with mu = 1 and lam = 0: (s² − 1) I for F = s I."""
+    """Stress of a neo-Hookean solid with mu = 1 and lam = 0: (s² − 1) I for F = s I."""
     return law_update("neo_hookean", F, [torch.tensor(1.0), torch.tensor(0.0)]).stress
 
 

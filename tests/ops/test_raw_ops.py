@@ -21,7 +21,7 @@ Changes = Callable[[Arguments], Iterator[tuple[Arguments, str]]]
 OPS = operators.operators()
 CALLS = [(dim, *call) for dim in (2, 3) for call in operators.calls(dim)]
 COMPARED = ("x", "F", "state", "velocity", "nodes", "r", "gravity", "previous_status")
-"""What the shapes of other arguments are compared with."""
+"""Arguments that define the shapes of the others."""
 ANY_NUMBER = ("mu", "lam", "alpha", "cohesion", "scene_dt", "scene_time", "obstacles")
 """Tensors that are given once, per scene or per particle."""
 TOPOLOGY = ("table", "block", "offsets", "index", "schedule", "scene")

@@ -7,7 +7,7 @@ OP = torch.ops.torch_mpm.take
 
 
 def fields(P: int, device: str) -> list[torch.Tensor]:
-    """Of several types, in rows, in columns, with gaps, and of no numbers at all."""
+    """Fields of several types, in rows, in columns, with gaps, and empty ones."""
     generator = torch.Generator().manual_seed(1)
     numbers = torch.randn(P, 3, 3, generator=generator)
     given = [

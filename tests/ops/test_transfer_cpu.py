@@ -244,7 +244,7 @@ def test_overflow_leaves_out_whole_particles(dim, max_blocks):
     assert torch.equal(blocks.index.sort()[0], torch.arange(2000, dtype=torch.int32))
     count = int(blocks.offsets[-1])
     transferred = blocks.index[:count].long()
-    # Those whose whole support lies in active blocks have weights that sum to one in the reference.
+    # Particles with their whole support in active blocks have weights that sum to one in the reference.
     whole = (reference.support(blocks, x).weight.sum(1) > 0.5).nonzero()[:, 0]
     assert torch.equal(transferred.sort()[0], whole)
     results = run_all(blocks, *inputs)

@@ -1,4 +1,4 @@
-"""What only CUDA can get wrong: activation without the host, crowded and sparse blocks, atomics, graph capture."""
+"""Failures specific to CUDA: activation without the host, crowded and sparse blocks, atomics, graph capture."""
 
 import dataclasses
 

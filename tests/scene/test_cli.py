@@ -87,7 +87,7 @@ def test_pictures_of_a_drawing_that_was_killed_are_those_of_one_that_was_not(tmp
 
 
 def test_a_complete_run_is_resumed(scene, tmp_path, capsys):
-    """What a kill after the simulation has kept from being made is made; then there is a line and nothing else."""
+    """Files missing after a kill are written; the next resume prints a line and writes nothing."""
     pytest.importorskip("meshio")
     out = tmp_path / "out"
     run = ["run", str(scene), "-o", str(out), "--set", "output.vtk=true", "--quiet", "--resume"]

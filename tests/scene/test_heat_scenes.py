@@ -134,7 +134,7 @@ def test_method_of_the_solve(tmp_path):
 
 
 def test_sand_warms_by_the_energy_it_loses(tmp_path):
-    """What the column of the example loses as mechanical energy is heat, but for the share of floor and transfer."""
+    """Mechanical energy lost by the column of the example is heat, except the part lost to floor and transfer."""
     overrides = ["grid.dx=0.04", "duration=0.6", "fps=5", 'device="cpu"']
     Scene.load(Path(__file__).parents[2] / "examples" / "friction_heat.toml", overrides).run(tmp_path / "out")
     with Trajectory(tmp_path / "out") as read:

@@ -61,7 +61,7 @@ def unfinished(stopped, tmp_path):
 
 
 def told(capsys, *arguments):
-    """What the command line says when it refuses."""
+    """Error output of a failing command."""
     assert main([str(a) for a in arguments]) == 1
     return capsys.readouterr().err
 

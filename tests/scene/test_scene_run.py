@@ -337,7 +337,7 @@ def test_twenty_sigkills_at_random_moments(tmp_path):
 
 
 def events_of(folder, monkeypatch, words):
-    """What a run does in its order, and what its checkpoints say of each frame."""
+    """Events of a run in their order, and the record of each frame in its checkpoints."""
     events, records = [], []
     rollout, submit = module.rollout, writer.FrameWriter.submit
 

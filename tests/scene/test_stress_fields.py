@@ -74,7 +74,7 @@ def padded(F):
 
 @pytest.mark.parametrize("name", ELASTIC)
 def test_the_out_of_plane_stress_is_that_of_the_law_in_3d(name, device):
-    """Of F with F_zz = 1, whose stress in the plane is that in 2-D too."""
+    """For F with F_zz = 1; the in-plane stress equals that in 2-D."""
     F, law = random_deformations(size=0.05), ELASTIC[name]()
     flat, whole = state_of(F, device), state_of(padded(F), device)
     if "log_plastic_volume" in law.extra_fields:

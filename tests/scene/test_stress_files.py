@@ -193,7 +193,7 @@ def test_pictures_say_which_stress_they_show(names, dim, label):
 
 
 def test_von_mises_stress_of_arrays():
-    """Of uniaxial stress, pressure, and shear; in plane strain with and without its third component."""
+    """Uniaxial stress, pressure, and shear; plane strain with and without the third component."""
     shear = np.array([[0.0, 2.0], [2.0, 0.0]])
     assert von_mises(np.diag([7.0, 0.0, 0.0])) == pytest.approx(7) and von_mises(5 * np.eye(3)) == pytest.approx(0)
     assert von_mises(shear) == pytest.approx(2 * np.sqrt(3))
