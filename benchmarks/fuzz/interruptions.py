@@ -181,7 +181,9 @@ class Interruptions:
         found = [outcome.kind] if outcome.kind in ("crash", "traceback") else []
         if outcome.kind == "time limit" or late > SOON:
             found.append("late end")
-        expected = {0, -number} if number == signal.SIGKILL else {0, STATUS[number], 130 if words[0] == "run" else 0}
+        expected = {0, -number}  # the signal itself ends a process whose command has ended
+        if number != signal.SIGKILL:
+            expected |= {STATUS[number], 130 if words[0] == "run" else 0}
         if outcome.kind == "ok" and outcome.status not in expected:
             found.append("wrong exit status")
         if number != signal.SIGKILL and (left := self._hidden()):
