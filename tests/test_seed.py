@@ -238,7 +238,7 @@ def test_an_exact_number_is_a_choice_from_the_widest_spacing_that_has_as_many(sh
 def test_a_shape_that_is_smaller_than_its_volume_says():
     box = seed.Box((0.0, 0.0), (1.0, 1.0))
     box.volume = 1e6
-    with pytest.raises(ValueError, match=r"takes less than 200 points.*is its volume right"):
+    with pytest.raises(ValueError, match=r"has space for fewer than 200 points.*is its volume correct"):
         seed.fill(box, 0.1, count=200)
 
 
