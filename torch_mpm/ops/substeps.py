@@ -3,7 +3,8 @@
     torch.ops.torch_mpm.substeps(x, v, mass, volume, C, F, J, residual, history, scene, ids, material, previous_status,
         laws, options, parameters, variables, n, dt, apic, flip, wants_C, stress_form, gravity, wall_kind, wall_plane,
         wall_friction, obstacles, data, shape, sizes, contact, obstacle_scene, start, end, time, scenes,
-        max_blocks, grows, resident, records, impulse, scene_dt, scene_time, lattice, layout)
+        max_blocks, grows, resident, records, impulse, scene_dt, scene_time, lattice, layout,
+        schedule=-1)
         -> (x, v, C, F, J, history, status, impulse, time, residual, record)
 
 `torch_mpm.substeps_arguments(step, state, n, dt)` returns the arguments; docs/training.md has an example.
@@ -22,6 +23,16 @@ of a second ahead of the device. With `resident` batches of small scenes may be 
 scene; sums, also those of gradients, may then round differently. With `records` all inputs of the adjoint are stored in
 `record`, opaque bytes, and no step is recomputed, except where impulses are counted or the pool had to grow. `residual`
 is `State.x_residual`; without it positions are not compensated.
+
+`schedule` is the number of a schedule in the order of csrc/rollout/plan.h; -1 chooses the fastest. A schedule that does
+not support the call is an error with the reason; its sums may round differently.
+
+    torch.ops.torch_mpm.plan_substeps(schedule, *facts) -> (schedule, max_blocks, steps, order, reasons)
+    torch.ops.torch_mpm.latest_schedule(x) -> int
+
+The first plans a call of any device by its facts (`torch_mpm.rollouts.plan.Facts`), without tensors: its schedule, the
+blocks of its pool or -1, its steps at most, the order of its particles, and a line "schedule: reason" for each of the
+others. The second returns the schedule of the latest call of this thread on the device of a tensor.
 
 Several times a second both ops run the handlers of signals, on the main thread. Where one of them raises, the op ends
 with a RuntimeError and without a result; `torch_mpm.rollout` raises the exception of the handler.
