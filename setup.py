@@ -59,7 +59,7 @@ NVCC_FLAGS = [
 # Definitions that distinguish the objects of one source.
 VARIANTS = ("-DTORCH_MPM_ISA=", "-DMPM_SCALAR=", "-DMPM_DIMENSION=", "-DMPM_LAW_HEADER=")
 
-# Files csrc/*/*.cpu.cpp are compiled once per level, in the namespace named by TORCH_MPM_ISA.
+# Files csrc/*/**/*.cpu.cpp are compiled once per level, in the namespace named by TORCH_MPM_ISA.
 X86_LEVELS = {"baseline": "x86-64", "avx2": "x86-64-v3", "avx512": "x86-64-v4"}
 
 
@@ -230,18 +230,18 @@ def cpu_library(levels: dict[str, list[str]]) -> Library:
     # csrc/cpu/isa.h forwards calls to the levels that exist.
     flags = ["-DTORCH_MPM_BACKEND=cpu", *(f"-DTORCH_MPM_HAS_{level.upper()}" for level in levels)]
     plain_options = [f"-march={X86_LEVELS['baseline']}"] if next(iter(levels.values())) else []
-    plain = sorted([*CSRC.glob("*/*.op.cpp"), *(CSRC / "cpu").glob("*.cpp")])
+    plain = sorted([*CSRC.glob("*/**/*.op.cpp"), *(CSRC / "cpu").glob("*.cpp")])
     objects = [(source, "cxx", [*flags, *plain_options]) for source in plain]
     # The baseline comes first: of an inline function that several objects define, the linker keeps the first, and that
     # one must run on every machine.
     for level, options in levels.items():
         own = [*flags, *options, f"-DTORCH_MPM_ISA={level}"]
-        objects += [(source, "cxx", [*own, *part]) for source, part in parts(CSRC.glob("*/*.cpu.cpp"))]
+        objects += [(source, "cxx", [*own, *part]) for source, part in parts(CSRC.glob("*/**/*.cpu.cpp"))]
     return Library("torch_mpm/lib/libtorch_mpm_cpu.so", objects, "link_cpu")
 
 
 def cuda_library() -> Library:
-    sources = [*parts(CSRC.glob("*/*.op.cpp")), *parts(CSRC.glob("*/*.cu"))]
+    sources = [*parts(CSRC.glob("*/**/*.op.cpp")), *parts(CSRC.glob("*/**/*.cu"))]
     objects = [(source, "nvcc", ["-DTORCH_MPM_BACKEND=cuda", *part]) for source, part in sources]
     return Library("torch_mpm/lib/libtorch_mpm_cuda.so", objects, "link_cuda")
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import torch_mpm as mpm
-from torch_mpm import captured_steps
+from torch_mpm.rollouts import graph_segments
 
 F64 = torch.float64
 CYCLES = 200_000_000  # of a kernel that runs for a tenth of a second
@@ -28,7 +28,7 @@ def still_busy(stream: torch.cuda.Stream) -> torch.cuda.Event:
 @pytest.mark.parametrize("fails", [False, True])
 def test_the_current_stream_waits_for_the_stream_of_graphs(fails):
     device = torch.device("cuda", torch.cuda.current_device())
-    with contextlib.suppress(ZeroDivisionError), captured_steps._on_own_stream(device):
+    with contextlib.suppress(ZeroDivisionError), graph_segments._on_own_stream(device):
         end = still_busy(torch.cuda.current_stream())
         if fails:
             raise ZeroDivisionError
@@ -49,7 +49,7 @@ FAILURE = """
 import torch
 import torch_mpm as mpm
 from test_capture_errors import blob
-from torch_mpm import captured_steps
+from torch_mpm.rollouts import graph_segments
 from torch_mpm.graphs import Replays
 
 class Waiting(torch.nn.Module):
@@ -76,7 +76,7 @@ torch.cuda.empty_cache()  # refused by an allocator that stays in the capture
 assert torch.isfinite(mpm.rollout(step, state, 20, 1e-4).x).all()
 """
 FAILURES = {
-    "captured": "mpm.captured(Waiting(step, captured_steps.TRIALS + 1), state, 1e-4)",
+    "captured": "mpm.captured(Waiting(step, graph_segments.TRIALS + 1), state, 1e-4)",
     "replays": "Replays(lambda s, w=Waiting(step, 1): w(s, 1e-4), state, step.grid.pool(state.x, None))",
 }
 

@@ -16,14 +16,14 @@ from cases.rollouts import F64, assert_equal, blob, box, one_by_one
 from torch import nn
 
 import torch_mpm as mpm
-from torch_mpm import captured_steps
 from torch_mpm.activation_record import uncounted
 from torch_mpm.capture import Recordings
+from torch_mpm.rollouts import graph_segments
 
 DT = 2e-4
 
 
-class Repeated(captured_steps.Graphs):
+class Repeated(graph_segments.Graphs):
     """Imitation of a replay: arguments and results have fixed memory, and a backward pass overwrites its inputs."""
 
     def record(self, beside):
@@ -37,12 +37,12 @@ class Repeated(captured_steps.Graphs):
 
     def forward(self, given):
         with torch.no_grad():
-            captured_steps.copy_all(self.read, given)
-        with captured_steps.no_hooks(), torch.set_grad_enabled(any(t.requires_grad for t in self.read)):
+            graph_segments.copy_all(self.read, given)
+        with graph_segments.no_hooks(), torch.set_grad_enabled(any(t.requires_grad for t in self.read)):
             self._now = self._steps(*self.read)
         Repeated.spoilt = None
         with torch.no_grad():
-            captured_steps.copy_all(self._ends, self._now)
+            graph_segments.copy_all(self._ends, self._now)
         return self._ends
 
     def backward(self, grads):
@@ -59,17 +59,17 @@ class Repeated(captured_steps.Graphs):
 def recorded(device, monkeypatch):
     """The recordings that are made from here on."""
     made = []
-    base = captured_steps.Graphs if device == "cuda" else Repeated
+    base = graph_segments.Graphs if device == "cuda" else Repeated
 
     class Counted(base):
         def record(self, beside):
             super().record(beside)
             made.append(self)
 
-    monkeypatch.setattr(captured_steps, "Graphs", Counted)
+    monkeypatch.setattr(graph_segments, "Graphs", Counted)
     if device == "cpu":
-        monkeypatch.setattr(captured_steps, "has_graphs", lambda device: True)
-        monkeypatch.setattr(captured_steps, "_on_own_stream", lambda device: contextlib.nullcontext())
+        monkeypatch.setattr(graph_segments, "has_graphs", lambda device: True)
+        monkeypatch.setattr(graph_segments, "_on_own_stream", lambda device: contextlib.nullcontext())
     return made
 
 

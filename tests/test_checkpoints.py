@@ -12,8 +12,8 @@ from torch.utils.checkpoint import checkpoint as torch_checkpoint
 import torch_mpm as mpm
 from benchmarks.speed import checkpoints as study
 from benchmarks.speed import memory
-from torch_mpm import checkpoints
 from torch_mpm.implicit import Implicit
+from torch_mpm.rollouts import checkpoints
 
 N, DT = 13, 1e-3
 

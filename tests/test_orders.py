@@ -8,8 +8,7 @@ from helpers import OpNames
 from torch import Tensor
 
 import torch_mpm as mpm
-from torch_mpm import adaptive
-from torch_mpm.rollouts import fused_op, plan
+from torch_mpm.rollouts import fused_op, plan, until_time
 
 DT = 1e-4
 
@@ -24,7 +23,7 @@ def few(monkeypatch):
         return whole(schedule, facts)._replace(order=int(unsorted))
 
     monkeypatch.setattr(plan, "plan_call", planned)
-    monkeypatch.setattr(adaptive, "plan_call", planned)
+    monkeypatch.setattr(until_time, "plan_call", planned)
 
 
 @pytest.fixture

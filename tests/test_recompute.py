@@ -6,7 +6,7 @@ import sys
 import pytest
 import torch
 
-from torch_mpm.recompute import called_again
+from torch_mpm.rollouts.recompute import called_again
 
 F64 = torch.float64
 WEIGHT = torch.linspace(0.5, 1.5, 9, dtype=F64).reshape(3, 3).requires_grad_()

@@ -1,16 +1,13 @@
 """torch_mpm: differentiable Material Point Method operators for PyTorch."""
 
+import importlib
 from typing import TYPE_CHECKING, Any
 
 from . import _library as _library
-from . import containers, laws, ops, particle_operations, seed
-from .adaptive import Arrival, rollout_to
+from . import _moved, containers, laws, ops, particle_operations, seed
 from .boundaries import SDF, Box, Capsule, Plane, Revolved, Sphere, Walls, Waypoints
-from .captured_steps import captured
 from .cfl import stable_dt
-from .checkpoints import Checkpoints
 from .data.trajectory import Trajectory
-from .environments import Environments
 from .errors import (
     DamagedFileError,
     FrontWarning,
@@ -20,7 +17,6 @@ from .errors import (
     SimulationError,
 )
 from .failures import Failures
-from .gradient_norms import GradientNorms
 from .grid import Blocks, Grid
 from .heat import Heat
 from .heat import boundaries as heat_boundaries
@@ -40,9 +36,14 @@ from .ops import (
     svd3,
 )
 from .parameters import PerMaterial, Table
-from .recording import Frames, frames
-from .rollout_estimate import RolloutEstimate, estimate_rollout
 from .rollouts import RolloutPlan, plan_rollout, rollout, substeps_arguments
+from .rollouts.checkpoints import Checkpoints
+from .rollouts.environments import Environments
+from .rollouts.estimate import RolloutEstimate, estimate_rollout
+from .rollouts.frames import Frames, frames
+from .rollouts.gradient_norms import GradientNorms
+from .rollouts.graph_segments import captured
+from .rollouts.until_time import Arrival, rollout_to
 from .state import State
 from .step import Step
 
@@ -108,6 +109,7 @@ __all__ = [
 ]
 
 containers.register()
+_moved.install()
 
 
 def __getattr__(name: str) -> Any:
@@ -116,4 +118,6 @@ def __getattr__(name: str) -> Any:
         from .scene import Scene
 
         return Scene
+    if name in _moved.MOVED:
+        return importlib.import_module(f"{__name__}.{name}")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from torch_mpm.checkpoints import contexts
 from torch_mpm.compat import mpm_pytorch, nclaw, physgaussian
+from torch_mpm.rollouts.checkpoints import contexts
 
 from . import work
 from .inference_peer_warp import WarpSimulator

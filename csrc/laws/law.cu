@@ -2,9 +2,9 @@
 #define MPM_REGISTER_LAW(Law) static const bool Law##_is_entered = enter<cuda::LawLaunches, Law>(0);
 
 #include "laws/registry.h"
-#include "rollout/g2p2g.cuh"
-#include "rollout/persistent.cuh"
-#include "rollout/resident.cuh"
+#include "rollout/schedules/block_per_scene.cuh"
+#include "rollout/schedules/fused_g2p2g.cuh"
+#include "rollout/schedules/persistent.cuh"
 
 namespace mpm::cuda {
 

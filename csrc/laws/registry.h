@@ -4,9 +4,9 @@
 #include <vector>
 
 #include "laws/law.h"
-#include "rollout/g2p2g.h"
-#include "rollout/persistent.h"
-#include "rollout/resident.h"
+#include "rollout/schedules/block_per_scene.h"
+#include "rollout/schedules/fused_g2p2g.h"
+#include "rollout/schedules/persistent.h"
 
 // Registry of the compiled laws with their kernels. Each object file of laws/law.cpu.cpp and laws/law.cu registers its
 // laws when the library is loaded; ops find them by name, and Python reads the whole list.

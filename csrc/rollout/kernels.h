@@ -5,7 +5,7 @@
 #include "rollout/g2p2g_chunks.h"
 #include "rollout/laws_p2g.h"
 #include "rollout/next_grid.h"
-#include "rollout/resident.h"
+#include "rollout/schedules/block_per_scene.h"
 #include "rollout/survey.h"
 
 #define MPM_ROLLOUT_KERNELS(PLAIN, ORDERED, SIZE)   \

@@ -1,4 +1,4 @@
-#include "rollout/substeps.h"
+#include "rollout/inputs.h"
 
 // What a survey asks of the laws: stress, tangent modulus and energy of all particles, each by its own law.
 namespace mpm {

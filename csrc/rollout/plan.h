@@ -100,14 +100,14 @@ constexpr int64_t kLeastSortedSteps = 64, kLeastSortedParticles = 1 << 15;
 // Whether a block per scene is faster than kernels of whole grids, by what both took on an H200 [µs].
 template <int D>
 bool resident_pays(int64_t particles, int64_t scenes) {
-  if (scenes == 1) return particles <= 96;  // else a kernel with many thread blocks is (rollout/persistent.h)
+  if (scenes == 1) return particles <= 96;  // else a kernel with many thread blocks is (rollout/schedules/persistent.h)
   const double turns = std::fmax(1, double(scenes) / 132), size = double(particles) / double(scenes);
   const double resident = 8 + turns * (2.5 + (D == 2 ? 0.019 : 0.021) * size);
   const double together = 14 + double(particles) / 3500 + 0.07 * double(scenes);
   return resident < together;
 }
 
-// About how many items the particles of a step make if the pool has `blocks` (rollout/persistent.h).
+// About how many items the particles of a step make if the pool has `blocks` (rollout/schedules/persistent.h).
 inline double items_of_step(const PlanFacts& f, int64_t blocks) {
   const double active = double(blocks) / 1.5;                                // of a pool that has grown
   if (f.dim == 2) return std::max(0.8 * active, double(f.particles) / 150);  // most have particles, seldom two items

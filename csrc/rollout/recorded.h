@@ -1,7 +1,7 @@
 #pragma once
 
 #include "common/signals.h"
-#include "rollout/substeps.h"
+#include "rollout/step_kernels.h"
 
 // n steps with what their adjoint reads of each: the particles, and the active blocks and nodes where these take less
 // memory than the particles do.
@@ -218,7 +218,7 @@ Recorded<T, D>::Recorded(const SubstepsInputs& in, const OptionalTensor& memory,
   grid_in(one, {});
   grid_size_ = one.size();
   one.template tensor<T>(in.x, Pool<T, D>::nodes_shape(steps.activation), in.x.scalar_type());
-  // At most half of what the particles take; torch_mpm/rollouts.py counts on it.
+  // At most half of what the particles take; torch_mpm/rollouts/budget.py counts on it.
   keeps_grids_ = 2 * one.size() <= in.x.size(0) * (2 * D + 4 * D * D) * int64_t(sizeof(T));
   lay_out(counted);
   memory_ = has(memory) ? *memory : empty(in.x, {counted.size()}, ScalarType::Byte);

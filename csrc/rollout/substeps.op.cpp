@@ -1,12 +1,12 @@
-#include <atomic>
-
 #include "common/signals.h"
 #include "rollout/recorded.h"
 #include "rollout/replay.h"
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
-#include "rollout/own_particles.h"
+#include "rollout/schedules/sorted_cpu.op.h"
 #else
-#include "rollout/merged.h"
+#include "rollout/schedules/block_per_scene.op.h"
+#include "rollout/schedules/fused_g2p2g.op.h"
+#include "rollout/schedules/persistent.op.h"
 #endif
 
 // n steps of a simulation in one call.
@@ -20,101 +20,6 @@ Tensor copy_of(const Tensor& t) {
   torch::stable::copy_(copy, t);
   return copy;
 }
-
-#if MPM_BACKEND == MPM_BACKEND_IS_cuda
-// To a kernel of many substeps: those of scenes that have their own.
-template <class T, int D, class Arguments>
-void give_clocks(const Substeps<T, D>& s, Arguments& a) {
-  if (!s.scene_time.defined()) return;
-  a.scene_time = static_cast<double*>(s.scene_time.data_ptr());
-  a.scene_dt = static_cast<const T*>(s.in.scene_dt->data_ptr());
-}
-
-// n substeps, after the activation of the first one, of particles that move in place. That one follows so many substeps
-// of the call, and begins at a time.
-template <class T, int D>
-void take_resident(Substeps<T, D>& s, int64_t n, int64_t after, double time, const int* activated, int* status,
-                   backend::Stream stream) {
-  const SubstepsInputs& in = s.in;
-  const int64_t P = in.x.size(0), rows = (P + 64 * in.scenes) * kMostResidentRow;
-  const Tensor row_memory = empty(in.x, {rows}, ScalarType::Byte);
-  // A scene that grows takes new ones each time; all of them together, twice what they should want.
-  const int64_t spare = std::min<int64_t>(2 * int64_t(s.activation.max_blocks), s.update.block_count);
-  const Tensor block_memory = empty(in.x, {spare * kMostResidentBlock}, ScalarType::Byte);
-  Tensor trouble = empty_int(in.x, {1 + in.scenes * int64_t(sizeof(SceneTrouble) / sizeof(int))});
-  backend::clear(trouble, stream);
-  int* const first = static_cast<int*>(trouble.data_ptr());
-  ResidentArguments<T, D> a{s.p2g, s.advance, s.update, s.contact, s.obstacles, int(in.scenes), n, time, in.dt};
-  a.contact.activations = nullptr;
-  a.contact.row += after * a.contact.step_stride;
-  give_clocks(s, a);
-  a.rows = static_cast<char*>(row_memory.data_ptr());
-  a.blocks = static_cast<char*>(block_memory.data_ptr());
-  a.spare_blocks = int(spare);
-  a.blocks_taken = first;
-  a.trouble = reinterpret_cast<SceneTrouble*>(first + 1);
-  s.calls[0].law->template kernels<T, D>().resident(s.laws[0], a, stream);
-  backend::resident_status({int(in.scenes), s.activation.max_blocks, n, a.trouble, activated, status, s.activation.id,
-                            s.activation.id_stride},
-                           stream);
-}
-#endif
-
-#if MPM_BACKEND == MPM_BACKEND_IS_cuda
-std::atomic<bool> loops_are_refused = CUDART_VERSION < 13000;
-#endif
-
-#if MPM_BACKEND == MPM_BACKEND_IS_cuda && CUDART_VERSION >= 13000
-// Substeps from the second on until the last alone is left, of particles that move in place. The status of the first is
-// in `status`, and is that of all of them in the end. False where the device takes no such graph: none, where processes
-// share it by MPS.
-template <class T, int D>
-bool take_persistent(Substeps<T, D>& s, int* activated, int* status, backend::Stream stream) {
-  const SubstepsInputs& in = s.in;
-  PersistentArguments<T, D> a{{s.update, s.contact, s.obstacles, s.activation.max_blocks}, s.p2g, s.late, s.advance};
-  const int64_t rows = s.pool.nodes.size(0);
-  Tensor more = empty(in.x, {2 * rows, 1 + D}, s.pool.nodes.scalar_type());
-  backend::clear(more, stream);
-  a.nodes[0] = static_cast<T*>(s.pool.nodes.data_ptr());
-  a.nodes[1] = static_cast<T*>(more.data_ptr());
-  a.nodes[2] = static_cast<T*>(torch::stable::narrow(more, 0, rows, rows).data_ptr());
-  a.steps = int(in.n - 2);
-  if (s.contact.step_time) a.step_time = s.contact.step_time + 1;
-  a.contact.step_time = nullptr;
-  a.contact.activations = nullptr;
-  a.contact.row += a.contact.step_stride;
-  give_clocks(s, a);
-  Tensor steps_so_far = empty_int(in.x, {1}), arrived = empty(in.x, {2}, ScalarType::Long);
-  backend::clear(steps_so_far, stream);
-  a.steps_so_far = static_cast<int*>(steps_so_far.data_ptr());
-  a.arrived = static_cast<unsigned long long*>(arrived.data_ptr());
-  a.drift = s.advance.drift;
-  a.activated = activated;
-  a.status = status;
-  s.activation.drift = a.drift;
-  s.activation.previous_status = status;
-  s.activation.status = activated;
-  static std::atomic<int> works_on = -1;  // a device that has taken one
-  int device = 0;
-  cudaGetDevice(&device);
-  const auto launch = [&](cudaStream_t on, unsigned long long condition) {
-    a.loop = condition;
-    s.find_blocks(on);
-    backend::clear(arrived, on);
-    s.calls[0].law->template kernels<T, D>().persistent(s.laws[0], a, on);
-  };
-  try {
-    if (works_on == device) launch(stream, 0);  // so that the device is at work while the host makes the graph
-    repeat(stream, launch, [&] { return on_host(a.steps_so_far, 1, stream)[0] < a.steps; });
-    works_on = device;
-  } catch (const std::exception&) {
-    if (works_on == device) throw;
-    cudaGetLastError();  // nothing was launched
-    loops_are_refused = true;
-  }
-  return !loops_are_refused;
-}
-#endif
 
 using Results = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
@@ -282,9 +187,9 @@ Results run(const SubstepsInputs& in) {
       double last_time = in.time;
       for (int64_t k = 1; k < n; k++) last_time += in.dt;
       s.activate(before, activated, stream);
-      take_resident(s, n - 1, 0, in.time, activated, now, stream);
+      take_scenes(s, n - 1, 0, in.time, activated, now, stream);
       s.activate(now, activated, stream);
-      take_resident(s, 1, n - 1, last_time, activated, now, stream);
+      take_scenes(s, 1, n - 1, last_time, activated, now, stream);
       after_substeps(P, n, stream);
       return;
     }

@@ -1,5 +1,4 @@
-"""Plans of rollouts: schedule, pool and steps of a call by its facts, for every device on any machine; and the value that
-all rollouts follow."""
+"""Plans: schedule, pool and steps of a call by its facts, on any machine; and how rollouts follow them."""
 
 import dataclasses
 

@@ -8,10 +8,10 @@ from collections.abc import Callable
 
 from torch import Tensor
 
-from ..checkpoints import Checkpoints, fitting
 from ..state import State
 from ..step import Step
-from ..step_cost import state_bytes, step_bytes
+from .checkpoints import Checkpoints, fitting
+from .memory import state_bytes, step_bytes
 
 PADDING = 87 * 64
 """Between two rows of particles on the CPU at most [bytes], csrc/common/tensors.h."""

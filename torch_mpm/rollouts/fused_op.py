@@ -8,7 +8,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..checkpoints import binomial, offloaded
 from ..errors import check_count, check_flag, shape_of
 from ..laws.calls import law_calls
 from ..ops.autograd import dispatch
@@ -16,7 +15,6 @@ from ..ops.contact import obstacle_arguments
 from ..ops.grid_update import per_scene, wall_arguments
 from ..ops.substeps import ARGUMENTS
 from ..ops.transfer import STRESS_FORMS
-from ..orders import STEPS_IN_ORDER, put_back, put_in_order
 from ..parameters import Overlay
 from ..pause import paused
 from ..signals import interruptible
@@ -24,7 +22,9 @@ from ..state import State, check_state
 from ..step import Step
 from ..step_times import StepTimes, clocks, requires_grad, time_after
 from ..topology import Status
+from .checkpoints import binomial, offloaded
 from .plan import SCHEDULES, RolloutPlan, differentiates, follows_paths, why_not_fused
+from .sorting import STEPS_IN_ORDER, put_back, put_in_order
 
 
 def in_calls(step: Step, state: State, n: int, dt: float | Tensor, plan: RolloutPlan) -> State:
@@ -126,15 +126,15 @@ def _arguments(
     schedule: str | None = None,
 ) -> tuple[dict[str, Any], list[list[str]]]:
     """Those of the op, in its order, and the names of the history of each law; of a prepared state."""
-    grid = step.grid
+    grid, law, boundaries = step.grid, step.law, step.boundaries.entries
     number, scene_dt, scene_time = clocks(state, dt, grid.scenes)
-    times = StepTimes.of(state, n, dt, grid.scenes) if follows_paths(step) else None
+    times = StepTimes.of(state, n, dt, grid.scenes) if boundaries and follows_paths(step) else None
     pool = grid.pool(state.x, state.scene)
-    step.law.check_parameters(len(state), grid.scenes)
+    law.check_parameters(len(state), grid.scenes)
     given: Any = Overlay(state, dt=dt)
-    calls = law_calls(step.law, given)
+    calls = law_calls(law, given)
     apic = step.transfer == "apic"
-    table, *others = obstacle_arguments(step.boundaries.entries, state.x, grid.scenes, times)
+    table, *others = obstacle_arguments(boundaries, state.x, grid.scenes, times)
     of_table = table is not None and table.requires_grad
     with_gradient = torch.is_grad_enabled() and (of_table or differentiates(step, state, dt))
     arguments = (
@@ -142,7 +142,7 @@ def _arguments(
         None if state.x_residual is None else state.x_residual.detach(),
         *(calls.history, state.scene, state.ids, calls.material, step._activations.status_for(state.x)),
         *(calls.names, calls.options, calls.parameters, calls.variables),
-        *(int(n), number, apic, step._flip_share, apic or step.law.viscous, STRESS_FORMS[step.stress_form]),
+        *(int(n), number, apic, step._flip_share, apic or law.viscous, STRESS_FORMS[step.stress_form]),
         _gravity(step, state.x),
         *wall_arguments(step.walls, grid),
         *(table, *others),

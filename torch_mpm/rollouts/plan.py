@@ -11,16 +11,13 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from .. import captured_steps
 from .._library import graph_loops
 from ..activation_record import ActivationRecord
-from ..anomaly import detecting
 from ..boundaries import Obstacle
 from ..boundaries.obstacles import motion_tensors
 from ..capture import NUMBERS, GraphCache, Recordings, is_captured, is_of_library, is_traced, is_transformed
-from ..checkpoints import Checkpoints, as_checkpoints
 from ..errors import check_count, shape_of
-from ..graphs import LEAST_STEPS, tensors_of
+from ..graphs import tensors_of
 from ..grid import Grid
 from ..laws import CompiledLaw
 from ..laws.active import Active
@@ -33,7 +30,11 @@ from ..parameters import has_hooks
 from ..state import State, check_state
 from ..step import Step
 from ..step_times import StepTimes, requires_grad
+from . import graph_segments
+from .anomaly import detecting
 from .budget import EVERYTHING, resolved, steps_of_a_call
+from .checkpoints import Checkpoints, as_checkpoints
+from .graph_replay import LEAST_STEPS
 
 Executor = Literal["fused", "replay", "graph", "loop"]
 SCHEDULES = ("per_step", "fused_g2p2g", "persistent", "block_per_scene", "sorted_cpu")
@@ -359,11 +360,11 @@ def _why_not_graphs(step: Any, state: State, dt: float | Tensor) -> str | None:
     """Why `in_graphs` cannot take the steps from a state; None where it can."""
     if not isinstance(step, nn.Module):
         return "it is no module"
-    if not captured_steps.has_graphs(state.x.device):
+    if not graph_segments.has_graphs(state.x.device):
         return "there are no graphs on the CPU"
     if (reason := _why_no_graph(step, state, dt)) is not None:
         return reason
-    if (place := captured_steps.another_device(step, state.x.device)) is not None:
+    if (place := graph_segments.another_device(step, state.x.device)) is not None:
         return f"a tensor of it is on {place}, the particles on {state.x.device}"
     return "there are no particles" if len(state) == 0 else None
 
@@ -406,7 +407,8 @@ def _all_of(step: Step) -> list[Tensor]:
 def facts_of(step: Step, state: State, n: int, dt: float | Tensor, stores_all: bool = False) -> Facts:
     """Those of n steps, in one op if possible."""
     x, grid = state.x, step.grid
-    laws, moved = laws_of(step.law), step.law.state_fields
+    law = step.law
+    laws, moved = laws_of(law), law.state_fields
     gradients = wants_gradient(step, state, n, dt)
     return Facts(
         x.is_cuda,

@@ -8,19 +8,19 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..anomaly import begin, detecting, watch
 from ..boundaries.control import control_step
-from ..captured_steps import in_graphs
-from ..checkpoints import Checkpoints, as_checkpoints, binomial, in_segments
 from ..errors import check_count, shape_of
-from ..gradient_norms import GradientNorms
-from ..graphs import replayed
 from ..ops.arguments import split_dt
-from ..rollout_parts import Hook, Parts
 from ..state import State, check_state
 from ..step import Step
+from .anomaly import begin, detecting, watch
 from .budget import EVERYTHING, resolved
+from .checkpoints import Checkpoints, as_checkpoints, binomial, in_segments
 from .fused_op import in_calls
+from .gradient_norms import GradientNorms
+from .graph_replay import replayed
+from .graph_segments import in_graphs
+from .hooks import Hook, Parts
 from .plan import RolloutPlan, plan_of_steps, why_not_fused
 
 

@@ -10,9 +10,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .errors import check_count, shape_of
+from ..errors import check_count, shape_of
+from ..state import FIELDS, State
 from .gradient_norms import GradientNorms
-from .state import FIELDS, State
 
 Control = Callable[[State, int], contextlib.AbstractContextManager[Callable[[State], State]]]
 """Control step of n steps from a state, see `torch_mpm.boundaries.control`."""

@@ -8,18 +8,18 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .boundaries.control import control_step
-from .boundaries.motion import PACE
-from .cfl import chosen_dt
+from ..boundaries.control import control_step
+from ..boundaries.motion import PACE
+from ..cfl import chosen_dt
+from ..errors import NUMBER_OR_TENSOR, check_count, check_number, shape_of
+from ..state import State
+from ..step import Step
 from .checkpoints import Checkpoints
-from .errors import NUMBER_OR_TENSOR, check_count, check_number, shape_of
-from .graphs import CHUNK, replay_all
-from .orders import put_back, put_in_order
-from .rollouts import RolloutPlan, rollout
-from .rollouts.fused_op import in_calls
-from .rollouts.plan import facts_of, follows_paths, plan_call, plan_of_steps
-from .state import State
-from .step import Step
+from .fused_op import in_calls
+from .graph_replay import CHUNK, replay_all
+from .plan import RolloutPlan, facts_of, follows_paths, plan_call, plan_of_steps
+from .run import rollout
+from .sorting import put_back, put_in_order
 
 SEGMENT = 16
 """Substeps between two choices of dt."""

@@ -10,9 +10,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .activation_record import aside
+from ..activation_record import aside
+from ..state import State
 from .checkpoints import CONSTANT
-from .state import State
 
 StepFunction = Callable[[State, "float | Tensor"], State]
 

@@ -2,8 +2,8 @@
 
 #include "cuda/barrier.cuh"
 #include "grid/status.h"
-#include "rollout/persistent.h"
 #include "rollout/plan.h"
+#include "rollout/schedules/persistent.h"
 #include "transfer/advance_gather.cuh"
 #include "transfer/scatter.cuh"
 

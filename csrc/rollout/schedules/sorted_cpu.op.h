@@ -4,7 +4,7 @@
 #include <type_traits>
 
 #include "cpu/schedule.h"
-#include "rollout/substeps.h"
+#include "rollout/step_kernels.h"
 
 // The particles of a call on the CPU. They move in place, and now and then change places in memory, so that they lie in
 // the order of their cells: packs of particles are loads and stores of whole registers then. At the end they are given

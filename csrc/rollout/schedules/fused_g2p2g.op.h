@@ -2,7 +2,7 @@
 
 #include "common/signals.h"
 #include "rollout/replay.h"
-#include "rollout/substeps.h"
+#include "rollout/step_kernels.h"
 
 // A call of many substeps on CUDA that owns its particles: G2P and the next P2G are one kernel while an activation
 // lasts. Between substeps

@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from ..errors import check_count, shape_of
+from ..state import State, check_state
+from ..step import Step
 from .checkpoints import Checkpoints
-from .errors import check_count, shape_of
-from .rollout_parts import Hook, Parts
-from .rollouts import rollout
-from .state import State, check_state
-from .step import Step
+from .hooks import Hook, Parts
+from .run import rollout
 
 
 class Frames(NamedTuple):

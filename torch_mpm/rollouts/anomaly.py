@@ -8,9 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .failures import NAMED
-from .grid import Grid
-from .state import State
+from ..failures import NAMED
+from ..grid import Grid
+from ..state import State
 
 
 def detecting() -> bool:

@@ -7,9 +7,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .laws import Mixture
-from .state import PARTICLE_FIELDS, State, _take_all
-from .step import Step
+from ..laws import Mixture
+from ..state import PARTICLE_FIELDS, State, _take_all
+from ..step import Step
 
 STEPS_IN_ORDER = 1024
 """Number of steps after which particles are sorted again."""

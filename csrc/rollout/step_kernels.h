@@ -9,6 +9,7 @@
 #include "grid/obstacle.op.h"
 #include "grid/walls.op.h"
 #include "laws/law.op.h"
+#include "rollout/inputs.h"
 #include "rollout/kernels.h"
 #include "rollout/plan.op.h"
 #include "transfer/kernels.h"
@@ -17,162 +18,8 @@
 // do them, in buffers that belong to the call. What the ops of rollouts share.
 namespace mpm {
 
-// The arguments of a call: a kind, the name in the schema, and the member of SubstepsInputs. The only list of them.
-#define MPM_SUBSTEPS_LIST(FIRST, X)             \
-  FIRST(TENSOR, x, x)                           \
-  X(TENSOR, v, v)                               \
-  X(TENSOR, mass, mass)                         \
-  X(TENSOR, volume, volume)                     \
-  X(OPTIONAL, C, C)                             \
-  X(OPTIONAL, F, F)                             \
-  X(OPTIONAL, J, J)                             \
-  X(OPTIONAL, residual, residual)               \
-  X(TENSORS, history, history)                  \
-  X(OPTIONAL, scene, scene)                     \
-  X(OPTIONAL, ids, ids)                         \
-  X(OPTIONAL, material, material)               \
-  X(OPTIONAL, previous_status, previous_status) \
-  X(STRING, laws, laws)                         \
-  X(INTS, options, options)                     \
-  X(TENSORS, parameters, parameters)            \
-  X(INTS, variables, variables)                 \
-  X(INT, n, n)                                  \
-  X(FLOAT, dt, dt)                              \
-  X(BOOL, apic, apic)                           \
-  X(FLOAT, flip, flip)                          \
-  X(BOOL, wants_C, wants_C)                     \
-  X(INT, stress_form, stress_form)              \
-  X(OPTIONAL, gravity, gravity)                 \
-  X(INTS, wall_kind, wall_kind)                 \
-  X(FLOATS, wall_plane, wall_plane)             \
-  X(FLOATS, wall_friction, wall_friction)       \
-  X(OPTIONAL, obstacles, obstacle_table)        \
-  X(OPTIONAL, data, obstacle_data)              \
-  X(INTS, shape, shape)                         \
-  X(INTS, sizes, sizes)                         \
-  X(INTS, contact, contact_kind)                \
-  X(INTS, obstacle_scene, obstacle_scene)       \
-  X(FLOATS, start, start)                       \
-  X(FLOATS, end, end)                           \
-  X(FLOAT, time, time)                          \
-  X(INT, scenes, scenes)                        \
-  X(INT, max_blocks, max_blocks)                \
-  X(BOOL, grows, grows)                         \
-  X(BOOL, resident, resident)                   \
-  X(BOOL, records, records)                     \
-  X(OPTIONAL, impulse, impulse)                 \
-  X(OPTIONAL, scene_dt, scene_dt)               \
-  X(OPTIONAL, scene_time, scene_time)           \
-  X(FLOATS, lattice, lattice_numbers)           \
-  X(INTS, layout, lattice_layout)               \
-  X(CHOICE, schedule, schedule)
-
-// Of each kind what the schema calls it, and the type of a member.
-#define MPM_SCHEMA_TENSOR(name) "Tensor " #name
-#define MPM_SCHEMA_OPTIONAL(name) "Tensor? " #name
-#define MPM_SCHEMA_TENSORS(name) "Tensor[] " #name
-#define MPM_SCHEMA_STRING(name) "str " #name
-#define MPM_SCHEMA_INT(name) "int " #name
-#define MPM_SCHEMA_INTS(name) "int[] " #name
-#define MPM_SCHEMA_FLOAT(name) "float " #name
-#define MPM_SCHEMA_FLOATS(name) "float[] " #name
-#define MPM_SCHEMA_BOOL(name) "bool " #name
-#define MPM_SCHEMA_CHOICE(name) "int " #name "=-1"
-#define MPM_MEMBER_TENSOR Tensor
-#define MPM_MEMBER_OPTIONAL OptionalTensor
-#define MPM_MEMBER_TENSORS Tensors
-#define MPM_MEMBER_STRING std::string
-#define MPM_MEMBER_INT int64_t
-#define MPM_MEMBER_INTS std::vector<int64_t>
-#define MPM_MEMBER_FLOAT double
-#define MPM_MEMBER_FLOATS std::vector<double>
-#define MPM_MEMBER_BOOL bool
-#define MPM_MEMBER_CHOICE int64_t
-
-#define MPM_FIRST_SCHEMA(kind, name, member) MPM_SCHEMA_##kind(name)
-#define MPM_NEXT_SCHEMA(kind, name, member) ", " MPM_SCHEMA_##kind(name)
-#define MPM_FIRST_PARAMETER(kind, name, member) const MPM_MEMBER_##kind& member
-#define MPM_NEXT_PARAMETER(kind, name, member) , const MPM_MEMBER_##kind& member
-#define MPM_FIRST_ARGUMENT(kind, name, member) member
-#define MPM_NEXT_ARGUMENT(kind, name, member) , member
-#define MPM_DECLARE_MEMBER(kind, name, member) MPM_MEMBER_##kind member;
-
-#define MPM_SUBSTEPS_SCHEMA MPM_SUBSTEPS_LIST(MPM_FIRST_SCHEMA, MPM_NEXT_SCHEMA)
-#define MPM_SUBSTEPS_PARAMETERS MPM_SUBSTEPS_LIST(MPM_FIRST_PARAMETER, MPM_NEXT_PARAMETER)
-#define MPM_SUBSTEPS_ARGUMENTS MPM_SUBSTEPS_LIST(MPM_FIRST_ARGUMENT, MPM_NEXT_ARGUMENT)
-
-// The arguments of a call.
-struct SubstepsInputs {
-  MPM_SUBSTEPS_LIST(MPM_DECLARE_MEMBER, MPM_DECLARE_MEMBER)
-  PackedLattice lattice{lattice_numbers, lattice_layout};
-};
-
-// The parts of a list between commas or other marks.
-inline std::vector<std::string> parts(const std::string& list, char mark) {
-  std::vector<std::string> result;
-  for (size_t begin = 0; begin <= list.size();) {
-    const size_t end = std::min(list.find(mark, begin), list.size());
-    result.push_back(list.substr(begin, end - begin));
-    begin = end + 1;
-  }
-  return result;
-}
-
 // As a growing grid does in torch_mpm/grid.py.
 inline int64_t with_headroom(int64_t blocks) { return blocks + blocks / 2 + 16; }
-
-// The laws of a mixture, or of a single material, with their places in the lists of parameters and history.
-struct LawCall {
-  LawEntry* law;
-  int material;
-  bool adds;  // to the stress of another law of the material
-  int64_t options;
-  Tensors parameters, history;
-  int64_t first_column;  // of the history of all laws
-};
-
-// The materials are parted by commas, and their laws by '+'. `variables` are the numbers of history tensors: a law may
-// go without.
-inline std::vector<LawCall> law_calls(const std::string& names, const std::vector<int64_t>& options,
-                                      const Tensors& parameters, const Tensors& history,
-                                      const std::vector<int64_t>& variables, int64_t dim) {
-  std::vector<LawCall> calls;
-  for (const std::string& material : parts(names, ',')) {
-    const int number = calls.empty() ? 0 : calls.back().material + 1;
-    for (const std::string& name : parts(material, '+')) {
-      const bool adds = !calls.empty() && calls.back().material == number;
-      calls.push_back({&law_of(name), number, adds, 0, {}, {}, 0});
-      STD_TORCH_CHECK(!adds || calls.back().law->info.additive, "a law after '+' must be one that is added, got ",
-                      name);
-    }
-  }
-  STD_TORCH_CHECK(options.size() == calls.size(), "options must have an entry per law, ", calls.size(), ", got ",
-                  options.size());
-  STD_TORCH_CHECK(variables.size() == calls.size(), "variables must have an entry per law, ", calls.size(), ", got ",
-                  variables.size());
-  size_t parameter = 0, variable = 0;
-  int64_t column = 0;
-  for (size_t k = 0; k < calls.size(); k++) {
-    LawCall& call = calls[k];
-    const size_t count = call.law->info.parameters.size();
-    STD_TORCH_CHECK(variables[k] >= 0, "variables must not be negative, got ", variables[k]);
-    const size_t end = parameter + count, last = variable + size_t(variables[k]);
-    STD_TORCH_CHECK(end <= parameters.size() && last <= history.size(),
-                    "parameters and history must have those of all laws one after another, got ", parameters.size(),
-                    " and ", history.size(), " tensors");
-    call.options = options[k];
-    call.first_column = column;
-    call.parameters = {parameters.begin() + parameter, parameters.begin() + end};
-    call.history = {history.begin() + variable, history.begin() + last};
-    parameter = end;
-    variable = last;
-    column += history_size(call.law->info, call.history, dim);
-  }
-  STD_TORCH_CHECK(parameter == parameters.size() && variable == history.size(),
-                  "parameters and history must be those of all laws, ", parameter, " and ", variable, " tensors, got ",
-                  parameters.size(), " and ", history.size());
-  return calls;
-}
 
 // The activation and the nodes, for one size of the pool of blocks.
 template <class T, int D>
@@ -214,88 +61,6 @@ Topology<T, D> topology_of(const ActivateArguments<T, D>& a) {
   t.schedule = a.schedule;
   t.schedule_size = a.schedule_size;
   return t;
-}
-
-// Where the fields of the particles are; absent where a simulation has none.
-template <class T>
-struct Particles {
-  Field<T> x, v, C, F, J, residual;
-  Field<T> history;  // [P, m], the entries of all laws
-};
-
-template <class T>
-Particles<const T> constant(const Particles<T>& p) {
-  return {constant(p.x), constant(p.v),        constant(p.C),      constant(p.F),
-          constant(p.J), constant(p.residual), constant(p.history)};
-}
-
-template <class T, int D>
-Particles<const T> given_particles(const SubstepsInputs& in, const Tensor& history) {
-  const Tensor& x = in.x;
-  const int64_t P = x.size(0);
-  return {input<T>(x, "x", x, {P, D}),
-          input<T>(in.v, "v", x, {P, D}),
-          input<T>(in.C, "C", x, {P, D, D}),
-          input<T>(in.F, "F", x, {P, D, D}),
-          input<T>(in.J, "J", x, {P}),
-          input<T>(in.residual, "residual", x, {P, D}),
-          field<const T>(history)};
-}
-
-// The history of all laws side by side, [P, m].
-inline Tensor packed_history(const Tensor& x, const Tensors& history, int64_t columns) {
-  Tensor packed = result(x, columns > 0, {x.size(0), columns});
-  int64_t first = 0;
-  for (const Tensor& variable : history) {
-    const int64_t width = variable.dim() == 1 ? 1 : variable.size(1) * variable.size(2);
-    Tensor part = torch::stable::narrow(packed, 1, first, width);
-    torch::stable::copy_(part, torch::stable::reshape(variable, {x.size(0), width}));
-    first += width;
-  }
-  return packed;
-}
-
-// A history variable from a column of all entries on: [P], or [P, D, D].
-template <class T, int D>
-Field<T> variable(const Field<T>& history, int64_t first, bool matrix) {
-  Field<T> f = history;
-  f.pointer += first * f.stride[1];
-  f.stride[2] = f.stride[1];
-  if (matrix) f.stride[1] *= D;
-  return f;
-}
-
-// The material of each particle, where there are several.
-inline void check_material(const OptionalTensor& material, const std::vector<LawCall>& calls, const Tensor& x) {
-  STD_TORCH_CHECK(has(material) || calls.back().material == 0, "several laws need material");
-  if (!has(material)) return;
-  check_shape(*material, "material", {x.size(0)});
-  check_type(*material, "material", ScalarType::Int, x);
-}
-
-// The arguments of a law for its own particles.
-template <class T, int D>
-LawArguments<T, D> law_arguments(const LawCall& call, const Tensor& x, const OptionalTensor& F, const OptionalTensor& J,
-                                 const OptionalTensor& C, const OptionalTensor& scene, const OptionalTensor& material,
-                                 int64_t scenes = -1) {
-  const LawInfo& info = call.law->info;
-  const char* const name = info.field == Deformation::gradient ? "F" : "J";
-  const OptionalTensor& state = info.field == Deformation::gradient ? F : J;
-  STD_TORCH_CHECK(has(state), "the law ", info.name, " needs ", name);
-  check_shape(*state, name, shape_of_state(info, x.size(0), D));
-  auto a = arguments<T, D>(info, *state, C, call.parameters, call.history, scene, call.options, scenes);
-  if (has(material)) a.members = {static_cast<const int*>(material->data_ptr()), material->stride(0), call.material};
-  return a;
-}
-
-// Where a law finds its history: in columns from `first` on.
-template <class T, int D>
-void set_history(LawArguments<T, D>& a, const LawCall& call, const Field<const T>& history, int64_t first) {
-  for (size_t k = 0; k < call.history.size(); k++) {
-    const bool matrix = call.law->info.history[k].matrix;
-    a.history[k] = variable<const T, D>(history, first, matrix);
-    first += matrix ? D * D : 1;
-  }
 }
 
 // The kernels of a step with their arguments, of which a call makes most once.
@@ -744,6 +509,14 @@ void Substeps<T, D>::use_pool() {
   contact.stride = 1 + D;
   if (pool.velocity.defined()) contact.result = static_cast<T*>(pool.velocity.data_ptr());
   advance.gather.nodes = {velocities()->value.e, 1 + D, D};
+}
+
+// To a kernel of many substeps: those of scenes that have their own.
+template <class T, int D, class Arguments>
+void give_clocks(const Substeps<T, D>& s, Arguments& a) {
+  if (!s.scene_time.defined()) return;
+  a.scene_time = static_cast<double*>(s.scene_time.data_ptr());
+  a.scene_dt = static_cast<const T*>(s.in.scene_dt->data_ptr());
 }
 
 }  // namespace mpm

@@ -2,7 +2,7 @@
 
 #include <cuda_pipeline.h>
 
-#include "rollout/g2p2g.h"
+#include "rollout/schedules/fused_g2p2g.h"
 #include "transfer/advance_gather.cuh"
 #include "transfer/scatter.cuh"
 

@@ -1,6 +1,6 @@
 #pragma once
 
-#include "rollout/resident.h"
+#include "rollout/schedules/block_per_scene.h"
 #include "transfer/advance_gather.cuh"
 #include "transfer/scatter.cuh"
 

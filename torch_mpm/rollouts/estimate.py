@@ -8,17 +8,17 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from .activation_record import aside
+from ..activation_record import aside
+from ..errors import check_count, shape_of
+from ..memory import in_words
+from ..state import State
+from ..step import Step
+from .budget import EVERYTHING, bytes_kept
 from .checkpoints import Checkpoints, as_checkpoints
-from .errors import check_count, shape_of
-from .memory import in_words
-from .rollout_parts import Parts
-from .rollouts import RolloutPlan, rollout
-from .rollouts.budget import EVERYTHING, bytes_kept
-from .rollouts.plan import plan_of_steps
-from .state import State
-from .step import Step
-from .step_cost import differentiable, seconds
+from .hooks import Parts
+from .memory import differentiable, seconds
+from .plan import RolloutPlan, plan_of_steps
+from .run import rollout
 
 TRIAL = 4
 """Number of steps of the measurement."""

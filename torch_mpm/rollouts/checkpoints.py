@@ -13,12 +13,12 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree
 
-from .activation_record import aside, uncounted
-from .boundaries.control import motions_of
-from .errors import check_count, check_flag, check_number
-from .grid import same_pools
+from ..activation_record import aside, uncounted
+from ..boundaries.control import motions_of
+from ..errors import check_count, check_flag, check_number
+from ..grid import same_pools
+from ..state import State
 from .recompute import called_again
-from .state import State
 
 Advance = Callable[[State, int, int], State]
 """Function of (state, count, k) that returns the state `count` steps later; the first of them is step k."""

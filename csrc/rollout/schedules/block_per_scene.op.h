@@ -1,0 +1,37 @@
+#pragma once
+
+#include "rollout/step_kernels.h"
+
+// The schedule of scenes that stay on a multiprocessor each, on CUDA.
+namespace mpm {
+
+// n substeps, after the activation of the first one, of particles that move in place. That one follows so many substeps
+// of the call, and begins at a time.
+template <class T, int D>
+void take_scenes(Substeps<T, D>& s, int64_t n, int64_t after, double time, const int* activated, int* status,
+                 backend::Stream stream) {
+  const SubstepsInputs& in = s.in;
+  const int64_t P = in.x.size(0), rows = (P + 64 * in.scenes) * kMostResidentRow;
+  const Tensor row_memory = empty(in.x, {rows}, ScalarType::Byte);
+  // A scene that grows takes new ones each time; all of them together, twice what they should want.
+  const int64_t spare = std::min<int64_t>(2 * int64_t(s.activation.max_blocks), s.update.block_count);
+  const Tensor block_memory = empty(in.x, {spare * kMostResidentBlock}, ScalarType::Byte);
+  Tensor trouble = empty_int(in.x, {1 + in.scenes * int64_t(sizeof(SceneTrouble) / sizeof(int))});
+  backend::clear(trouble, stream);
+  int* const first = static_cast<int*>(trouble.data_ptr());
+  ResidentArguments<T, D> a{s.p2g, s.advance, s.update, s.contact, s.obstacles, int(in.scenes), n, time, in.dt};
+  a.contact.activations = nullptr;
+  a.contact.row += after * a.contact.step_stride;
+  give_clocks(s, a);
+  a.rows = static_cast<char*>(row_memory.data_ptr());
+  a.blocks = static_cast<char*>(block_memory.data_ptr());
+  a.spare_blocks = int(spare);
+  a.blocks_taken = first;
+  a.trouble = reinterpret_cast<SceneTrouble*>(first + 1);
+  s.calls[0].law->template kernels<T, D>().resident(s.laws[0], a, stream);
+  backend::resident_status({int(in.scenes), s.activation.max_blocks, n, a.trouble, activated, status, s.activation.id,
+                            s.activation.id_stride},
+                           stream);
+}
+
+}  // namespace mpm
