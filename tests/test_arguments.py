@@ -8,7 +8,8 @@ import pytest
 import torch
 
 import torch_mpm as mpm
-from torch_mpm import boundaries, heat_boundaries, seed
+from torch_mpm import boundaries, heat_boundaries
+from torch_mpm.geometry import seed
 from torch_mpm.ops import g2p, g2p_advance, gather, grid_update, p2g, scatter
 
 NAN, INF = math.nan, math.inf

@@ -16,9 +16,9 @@ from cases.rollouts import F64, assert_equal, blob, box, one_by_one
 from torch import nn
 
 import torch_mpm as mpm
-from torch_mpm.activation_record import uncounted
-from torch_mpm.capture import Recordings
+from torch_mpm.cuda_graphs.capture import Recordings
 from torch_mpm.rollouts import graph_segments
+from torch_mpm.step.status import uncounted
 
 DT = 2e-4
 

@@ -9,7 +9,7 @@ from torch.utils import _pytree
 from torch.utils.data import DataLoader, Dataset
 
 import torch_mpm as mpm
-from torch_mpm.containers import from_tensordict, to_tensordict
+from torch_mpm.state.pytree import from_tensordict, to_tensordict
 
 
 def full_state(device="cpu"):

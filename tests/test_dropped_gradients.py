@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 import torch_mpm as mpm
-from torch_mpm import particle_operations, shapes
+from torch_mpm.geometry import shapes
+from torch_mpm.step import particle_operations
 
 GRID = mpm.Grid(0.1, (0.0, 0.0), (1.0, 1.0))
 LAW = mpm.NeoHookean(1e4, 0.3)

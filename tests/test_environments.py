@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 import torch_mpm as mpm
-from torch_mpm import particle_operations
+from torch_mpm.step import particle_operations
 
 F64 = torch.float64
 DT, N = 1e-3, 8

@@ -5,9 +5,9 @@ import socket
 
 import pytest
 
-from torch_mpm import seed
 from torch_mpm.errors import DamagedFileError
 from torch_mpm.files import LARGEST, LARGEST_TEXT, VARIABLE, check_file, read_text
+from torch_mpm.geometry import seed
 
 KINDS = {
     "pipe": "is a pipe, not a regular file",

@@ -10,8 +10,8 @@ from helpers import run_quick
 
 import torch_mpm as mpm
 from benchmarks.accuracy.locking import sag
-from torch_mpm.locking import LARGEST, least_bending, problem
-from torch_mpm.parameters import PerMaterial
+from torch_mpm.laws.locking import LARGEST, least_bending, problem
+from torch_mpm.laws.parameters import PerMaterial
 
 
 @pytest.mark.filterwarnings("ignore::torch_mpm.LockingWarning")

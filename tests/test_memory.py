@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from torch_mpm import cli, memory, optional
+from torch_mpm import cli, optional
+from torch_mpm.data import host_memory
 
 
 def raised(work):
@@ -39,34 +40,34 @@ OTHERS = [
 
 @pytest.mark.parametrize("error", SHORT, ids=str)
 def test_errors_of_memory(error):
-    assert memory.is_short(error)
+    assert host_memory.is_short(error)
     other = ValueError("the scene cannot be read")
     other.__cause__ = error
-    assert memory.is_short(other)
+    assert host_memory.is_short(other)
 
 
 @pytest.mark.parametrize("error", OTHERS, ids=str)
 def test_other_errors(error):
-    assert not memory.is_short(error)
+    assert not host_memory.is_short(error)
 
 
 def test_errors_of_numpy_and_torch_say_what_was_wanted():
     of_torch = raised(lambda: torch.empty(2**60, dtype=torch.int8))
     of_numpy = raised(lambda: np.empty(2**60, np.int8))
-    assert memory.is_short(of_torch) and memory.shortage(of_torch).startswith("1.15e+09 GB were wanted; ")
-    assert memory.is_short(of_numpy) and "Unable to allocate 1.00 EiB" in memory.shortage(of_numpy)
+    assert host_memory.is_short(of_torch) and host_memory.shortage(of_torch).startswith("1.15e+09 GB were wanted; ")
+    assert host_memory.is_short(of_numpy) and "Unable to allocate 1.00 EiB" in host_memory.shortage(of_numpy)
 
 
 def test_the_limit_of_the_process_counts(monkeypatch):
-    taken = memory.available
+    taken = host_memory.available
     limit = 2**60
-    monkeypatch.setattr(memory.resource, "getrlimit", lambda kind: (limit, limit))
+    monkeypatch.setattr(host_memory.resource, "getrlimit", lambda kind: (limit, limit))
     assert taken() < 2**60
     limit = 2**20  # below what is taken
-    assert memory.available() == 0
+    assert host_memory.available() == 0
     with pytest.raises(MemoryError, match=r"a picture takes about 1\.5 GB, and 0 bytes are available"):
-        memory.require(1.5e9, "a picture")
-    assert "of the 1.05 MB of address space that this process may take" in memory.shortage(MemoryError())
+        host_memory.require(1.5e9, "a picture")
+    assert "of the 1.05 MB of address space that this process may take" in host_memory.shortage(MemoryError())
 
 
 @pytest.mark.parametrize(
@@ -109,9 +110,9 @@ def test_too_little_address_space_is_an_error_before_compiled_code_ends_the_proc
     pytest.importorskip("h5py")
     from torch_mpm.data.hdf5 import h5py_module
 
-    monkeypatch.setattr(memory, "_of_process", lambda: 1e6)
+    monkeypatch.setattr(host_memory, "_of_process", lambda: 1e6)
     h5py_module()  # without a limit, whatever is free
-    monkeypatch.setattr(memory, "_limit", lambda: 10**9)
+    monkeypatch.setattr(host_memory, "_limit", lambda: 10**9)
     with pytest.raises(MemoryError, match=r"HDF5 takes about 16\.8 MB of address space, and 1 MB are available"):
         h5py_module()
     assert cli.main(["schema"]) == 1
@@ -122,5 +123,5 @@ def test_memory_that_cannot_be_looked_at_is_none(monkeypatch):
     def short():
         raise MemoryError
 
-    monkeypatch.setattr(memory, "_of_machine", short)
-    assert memory.available() == 0.0 and "0 bytes are free" in memory.shortage(MemoryError("x"))
+    monkeypatch.setattr(host_memory, "_of_machine", short)
+    assert host_memory.available() == 0.0 and "0 bytes are free" in host_memory.shortage(MemoryError("x"))

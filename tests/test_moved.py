@@ -1,6 +1,7 @@
 """Old import paths of modules, which work for one release."""
 
 import importlib
+import subprocess
 import sys
 
 import pytest
@@ -28,3 +29,24 @@ def test_an_attribute_of_the_package(monkeypatch):
     monkeypatch.delitem(vars(mpm), "checkpoints", raising=False)
     with pytest.warns(DeprecationWarning, match="has moved to torch_mpm.rollouts.checkpoints"):
         assert mpm.checkpoints.contexts is mpm.rollouts.checkpoints.contexts
+
+
+@pytest.mark.parametrize("package,name", [("grid", "Grid"), ("state", "State"), ("step", "Step")])
+def test_packages_that_were_modules(package, name):
+    module = importlib.import_module(f"torch_mpm.{package}")
+    with pytest.warns(DeprecationWarning, match=rf"torch_mpm.{package}.{name} has moved to torch_mpm.{package}\.\w+"):
+        assert getattr(module, name) is getattr(mpm, name)
+    with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
+        module.nothing  # noqa: B018
+
+
+def test_torch_mpm_itself_uses_the_new_paths():
+    program = (
+        "import importlib, pkgutil, torch_mpm\n"
+        "for module in pkgutil.walk_packages(torch_mpm.__path__, 'torch_mpm.'):\n"
+        "    if not module.name.endswith(('__main__', '_math')):\n"
+        "        importlib.import_module(module.name)\n"
+    )
+    words = [sys.executable, "-W", "error:torch_mpm:DeprecationWarning", "-c", program]
+    done = subprocess.run(words, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 import torch_mpm as mpm
-from torch_mpm import heat_boundaries, seed
+from torch_mpm import heat_boundaries
+from torch_mpm.geometry import seed
 from torch_mpm.ops import LAWS, law_energy, law_update
 
 B, EACH = 3, 4

@@ -5,7 +5,7 @@ import torch
 from cases.steps import block_state, make_step
 
 import torch_mpm as mpm
-from torch_mpm.particle_operations import Hold, Operations, Present, Push
+from torch_mpm.step.particle_operations import Hold, Operations, Present, Push
 
 DT = 1e-3
 

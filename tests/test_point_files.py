@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from torch_mpm import point_files, seed
+from torch_mpm.geometry import point_files, seed
 
 X = np.array([[0.5, -1.25, 3e-3], [2.0, 4.5, -7.0], [0.0, 1e3, 0.25]])
 V = np.array([1.0, 2.0, 3.5])

@@ -7,8 +7,8 @@ from helpers import TOLERANCE, relative_error
 from torch import Tensor
 
 import torch_mpm as mpm
+from torch_mpm.grid.topology import PADDING
 from torch_mpm.reference import advance, contact, grid_update, material, sand, transfer
-from torch_mpm.topology import PADDING
 
 F64 = torch.float64
 DT, N = 1e-3, 6

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from torch_mpm import seed
+from torch_mpm.geometry import seed
 
 DOUBLE = {"dtype": torch.float64}
 

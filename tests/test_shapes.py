@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 import torch_mpm as mpm
-from torch_mpm import shapes
 from torch_mpm.boundaries import Obstacle
-from torch_mpm.seed import Region
+from torch_mpm.geometry import shapes
+from torch_mpm.geometry.seed import Region
 
 VASE = ((0.1, -0.5), (0.6, -0.4), (0.3, 0.1), (0.7, 0.5), (0.15, 0.45))
 REACH = 1.3

@@ -10,8 +10,9 @@ import torch
 from torch import Tensor, nn
 
 import torch_mpm as mpm
-from torch_mpm import particle_operations, shapes
 from torch_mpm.boundaries import Obstacle
+from torch_mpm.geometry import shapes
+from torch_mpm.step import particle_operations
 
 GRID = mpm.Grid(0.1, (0.0, 0.0), (1.0, 1.0), deterministic=True)
 ELASTIC = mpm.NeoHookean(E=1e5, nu=0.3)

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from torch_mpm.activation_record import NO_PROBLEM
-from torch_mpm.topology import SceneStatus, Status
+from torch_mpm.grid.topology import SceneStatus, Status
+from torch_mpm.step.status import NO_PROBLEM
 
 HEADER = (Path(__file__).parent.parent / "csrc/grid/status.h").read_text()
 

@@ -10,7 +10,7 @@ import torch
 from helpers import random_particles
 
 import torch_mpm as mpm
-from torch_mpm.topology import Topology
+from torch_mpm.grid.topology import Topology
 
 
 @pytest.mark.parametrize("sizes", [(9,), (11, 0, 6)])

@@ -3,7 +3,7 @@
 import pytest
 
 from torch_mpm.cli import main
-from torch_mpm.view_server import is_own_page, viser_server
+from torch_mpm.render.viewer_server import is_own_page, viser_server
 
 
 @pytest.mark.parametrize(

@@ -4,23 +4,16 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from . import _library as _library
-from . import _moved, containers, laws, ops, particle_operations, seed
+from . import _moved, laws, ops
 from .boundaries import SDF, Box, Capsule, Plane, Revolved, Sphere, Walls, Waypoints
-from .cfl import stable_dt
 from .data.trajectory import Trajectory
-from .errors import (
-    DamagedFileError,
-    FrontWarning,
-    GridOverflowError,
-    LockingWarning,
-    PrecisionWarning,
-    SimulationError,
-)
-from .failures import Failures
-from .grid import Blocks, Grid
+from .errors import DamagedFileError, FrontWarning, GridOverflowError, LockingWarning, PrecisionWarning, SimulationError
+from .geometry import seed
+from .grid.grid import Blocks, Grid
 from .heat import Heat
 from .heat import boundaries as heat_boundaries
 from .laws import *  # noqa: F403
+from .laws.parameters import PerMaterial, Table
 from .ops import (
     HeatSolve,
     advance,
@@ -35,7 +28,6 @@ from .ops import (
     scatter,
     svd3,
 )
-from .parameters import PerMaterial, Table
 from .rollouts import RolloutPlan, plan_rollout, rollout, substeps_arguments
 from .rollouts.checkpoints import Checkpoints
 from .rollouts.environments import Environments
@@ -44,8 +36,12 @@ from .rollouts.frames import Frames, frames
 from .rollouts.gradient_norms import GradientNorms
 from .rollouts.graph_segments import captured
 from .rollouts.until_time import Arrival, rollout_to
-from .state import State
-from .step import Step
+from .state import pytree
+from .state.state import State
+from .step import particle_operations
+from .step.failures import Failures
+from .step.stability import stable_dt
+from .step.step import Step
 
 if TYPE_CHECKING:
     from .scene import Scene as Scene
@@ -108,7 +104,7 @@ __all__ = [
     "svd3",
 ]
 
-containers.register()
+pytree.register()
 _moved.install()
 
 

@@ -8,22 +8,50 @@ import importlib.machinery
 import sys
 import types
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 PACKAGE = __name__.rpartition(".")[0]
 MOVED = {
+    "activation_record": "step.status",
     "adaptive": "rollouts.until_time",
     "anomaly": "rollouts.anomaly",
+    "bspline": "grid.bspline",
+    "capture": "cuda_graphs.capture",
     "captured_steps": "rollouts.graph_segments",
+    "cfl": "step.stability",
     "checkpoints": "rollouts.checkpoints",
+    "containers": "state.pytree",
     "environments": "rollouts.environments",
+    "failures": "step.failures",
     "gradient_norms": "rollouts.gradient_norms",
+    "graphs": "cuda_graphs.graph",
+    "heat_boundaries": "heat.boundaries",
+    "impulses": "boundaries.impulses",
+    "locking": "laws.locking",
+    "memory": "data.host_memory",
+    "node_contact": "boundaries.apply",
     "orders": "rollouts.sorting",
+    "parameters": "laws.parameters",
+    "particle_operations": "step.particle_operations",
+    "pause": "step.pause",
+    "per_scene": "geometry.per_scene",
+    "point_files": "geometry.point_files",
     "recompute": "rollouts.recompute",
     "recording": "rollouts.frames",
+    "recording_keys": "cuda_graphs.keys",
+    "resolution": "grid.resolution",
     "rollout_estimate": "rollouts.estimate",
     "rollout_parts": "rollouts.hooks",
+    "seed": "geometry.seed",
+    "shapes": "geometry.shapes",
     "step_cost": "rollouts.memory",
+    "step_times": "step.clocks",
+    "surface_mesh": "geometry.surface_mesh",
+    "topology": "grid.topology",
+    "vectors": "geometry.vectors",
+    "view": "render.viewer",
+    "view_server": "render.viewer_server",
 }
 """New path of each old one, both relative to the package."""
 
@@ -44,6 +72,21 @@ class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         target = importlib.import_module(new)
         module.__doc__ = target.__doc__
         vars(module)["__getattr__"] = lambda name: getattr(target, name)
+
+
+def attributes_of(package: str, module: str) -> Callable[[str], Any]:
+    """A `__getattr__` for a package that was a module: the names of the module in it that has what it had."""
+
+    def attribute(name: str) -> Any:
+        if not name.startswith("__"):
+            new = f"{package}.{module}"
+            found = getattr(importlib.import_module(new), name, None)
+            if found is not None:
+                warnings.warn(f"{package}.{name} has moved to {new}.{name}", DeprecationWarning, stacklevel=2)
+                return found
+        raise AttributeError(f"module {package!r} has no attribute {name!r}")
+
+    return attribute
 
 
 def install() -> None:

@@ -15,8 +15,9 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from . import memory, optional
+from . import optional
 from .data import commands as data_sets
+from .data import host_memory
 from .data import reading_commands as reading
 from .data.commands import path_argument, set_argument
 from .interrupts import alarm
@@ -33,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         with signals_raise(came), warnings_in_lines():
             options = _parser().parse_args(arguments)
-            memory.require_address_space(LEAST, "a command with the packages that it imports")
+            host_memory.require_address_space(LEAST, "a command with the packages that it imports")
             options.command(options)
     except KeyboardInterrupt as error:
         return _ended(type(error))
@@ -122,9 +123,11 @@ NOTHING = 2**22
 
 def _message(error: Exception) -> str | None:
     """Message for the user. None for defects of torch_mpm, whose traceback should be visible."""
-    if memory.is_short(error) or memory.available() < NOTHING:  # Python may lose exceptions when memory is exhausted.
+    if (
+        host_memory.is_short(error) or host_memory.available() < NOTHING
+    ):  # Python may lose exceptions when memory is exhausted.
         remedy = "have a larger grid.dx, a smaller per_cell, or fewer fields and pictures; or free some memory"
-        return f"out of memory: {memory.shortage(error)}; {remedy}"
+        return f"out of memory: {host_memory.shortage(error)}; {remedy}"
     if isinstance(error, OSError) and error.strerror and error.filename is not None:
         return f"{error.filename}: {error.strerror}"
     names = {kind.__name__ for kind in type(error).__mro__}
@@ -278,7 +281,7 @@ def _draw_with_a_bar(folder: Path, scene: Any) -> list[Path]:
 
 
 def _check(options: argparse.Namespace) -> None:
-    from . import resolution
+    from .grid import resolution
     from .scene import Scene
     from .scene.substeps import check_substeps
 

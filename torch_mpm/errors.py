@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 if TYPE_CHECKING:
-    from .failures import Failures
+    from .step.failures import Failures
 
 FLOATING = (torch.float32, torch.float64)
 LARGEST = {dtype: torch.finfo(dtype).max for dtype in FLOATING}

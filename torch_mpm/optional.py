@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
-from . import memory
+from .data import host_memory
 
 
 def load(module: str, purpose: str, extra: str) -> Any:
@@ -24,7 +24,7 @@ def load(module: str, purpose: str, extra: str) -> Any:
     try:
         return importlib.import_module(module)
     except (ImportError, OSError, MemoryError, RuntimeError) as error:
-        if memory.is_short(error):
+        if host_memory.is_short(error):
             raise MemoryError(f"{purpose}: too little memory to import {package} ({error})") from error
         if isinstance(error, ModuleNotFoundError) and (error.name or "").partition(".")[0] == package:
             raise ImportError(

@@ -16,7 +16,7 @@ import torch
 
 import torch_mpm as mpm
 from torch_mpm.implicit import Implicit, equilibrium
-from torch_mpm.locking import least_bending
+from torch_mpm.laws.locking import least_bending
 
 from .. import common
 

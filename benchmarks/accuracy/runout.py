@@ -41,7 +41,7 @@ import torch
 from torch import Tensor
 
 import torch_mpm as mpm
-from torch_mpm.seed import Box, Points, fill
+from torch_mpm.geometry.seed import Box, Points, fill
 
 from .. import common
 

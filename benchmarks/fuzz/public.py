@@ -10,7 +10,8 @@ import torch
 
 import torch_mpm as mpm
 from benchmarks.fuzz.mutations import refuses
-from torch_mpm import heat_boundaries, seed
+from torch_mpm import heat_boundaries
+from torch_mpm.geometry import seed
 from torch_mpm.implicit import Implicit
 
 Call = tuple[Callable[..., Any], dict[str, Any]]

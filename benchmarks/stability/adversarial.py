@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 import torch_mpm as mpm
-from torch_mpm.parameters import Overlay
+from torch_mpm.laws.parameters import Overlay
 
 from .. import common
 from .stable_dt import LAWS as SOLIDS

@@ -3,7 +3,7 @@
 #include "common/tensors.h"
 #include "grid/topology.h"
 
-// The lattice and the topology as the ops take them, packed by torch_mpm/topology.py and unpacked here.
+// The lattice and the topology as the ops take them, packed by torch_mpm/grid/topology.py and unpacked here.
 namespace mpm {
 
 #define MPM_LATTICE_SCHEMA "float[] lattice, int[] layout"

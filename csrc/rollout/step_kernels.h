@@ -18,7 +18,7 @@
 // do them, in buffers that belong to the call. What the ops of rollouts share.
 namespace mpm {
 
-// As a growing grid does in torch_mpm/grid.py.
+// As a growing grid does in torch_mpm/grid/grid.py.
 inline int64_t with_headroom(int64_t blocks) { return blocks + blocks / 2 + 16; }
 
 // The activation and the nodes, for one size of the pool of blocks.

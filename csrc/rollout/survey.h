@@ -8,7 +8,7 @@
 namespace mpm {
 
 enum Survey : int {
-  kRate = 0,   // largest 1/dt of the limits of torch_mpm/cfl.py [1/s]
+  kRate = 0,   // largest 1/dt of the limits of torch_mpm/step/stability.py [1/s]
   kSpeed = 1,  // largest speed [m/s]
   kWrong = 2,  // particles that are not finite, outside the domain, or without a meaning for their law
   kSurveySize = 3,
@@ -90,7 +90,7 @@ MPM_HD T oscillation_rate(const SurveyArguments<T, D>& a, const One<T>& at, cons
 // 1/dt of the largest change of a stretch or a volume in a step: the positive root of change/dt² − g/dt − h.
 template <class T, int D>
 MPM_HD T deformation_rate(const SurveyArguments<T, D>& a, const One<T>& at, const T& inverse_inertia, const T& speed) {
-  constexpr double change = 0.5;  // of torch_mpm/cfl.py
+  constexpr double change = 0.5;  // of torch_mpm/step/stability.py
   T gradient = T(std::sqrt(a.bound)) * speed;
   if (a.C.pointer) gradient = root_of_squares(gradient, norm(load_matrix<D>(at, a.C)));
   T growth = norm(load_matrix<D>(at, a.stress)) * inverse_inertia;

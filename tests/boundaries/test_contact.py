@@ -9,9 +9,9 @@ from torch import Tensor
 
 import torch_mpm as mpm
 from torch_mpm.boundaries import Obstacle
+from torch_mpm.geometry.shapes import Cylinder, Shape
 from torch_mpm.ops import contact, fusible
 from torch_mpm.reference.contact import contact_velocity
-from torch_mpm.shapes import Cylinder, Shape
 
 KINDS = ["sticky", "slip", "separate"]
 

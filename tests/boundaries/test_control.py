@@ -15,9 +15,10 @@ from torch import Tensor
 from torch.utils import _pytree
 
 import torch_mpm as mpm
-from torch_mpm import heat_boundaries, shapes
+from torch_mpm import heat_boundaries
 from torch_mpm.boundaries import control
-from torch_mpm.recording_keys import StepKey
+from torch_mpm.cuda_graphs.keys import StepKey
+from torch_mpm.geometry import shapes
 
 F64 = torch.float64
 DT, N, V = 5e-4, 20, 1.0

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 import torch_mpm as mpm
-from torch_mpm import shapes
+from torch_mpm.geometry import shapes
 from torch_mpm.ops import contact
 from torch_mpm.ops.contact import fusible
 

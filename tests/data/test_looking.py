@@ -17,7 +17,7 @@ from torch_mpm.data.figures import draw_statistics, summary
 from torch_mpm.data.folder import DatasetError, DatasetFolder, MissingError
 from torch_mpm.data.pictures import draw_scenes
 from torch_mpm.render import read_png
-from torch_mpm.view import Viewer, following_frame
+from torch_mpm.render.viewer import Viewer, following_frame
 
 
 @pytest.fixture(scope="module")

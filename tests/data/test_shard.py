@@ -17,13 +17,7 @@ from small_dataset import forge, write_shard  # noqa: E402
 
 from torch_mpm.data import whole_files  # noqa: E402
 from torch_mpm.data.packing import content_hash, prepare_scene  # noqa: E402
-from torch_mpm.data.shard import (  # noqa: E402
-    Shard,
-    ShardRecord,
-    record_path,
-    scene_name,
-    shard_path,
-)
+from torch_mpm.data.shard import Shard, ShardRecord, record_path, scene_name, shard_path  # noqa: E402
 from torch_mpm.data.shard_writer import ShardWriter  # noqa: E402
 from torch_mpm.data.statistics import motion_sums  # noqa: E402
 from torch_mpm.errors import DamagedFileError  # noqa: E402

@@ -9,7 +9,7 @@ from helpers import OpNames, relative_error
 
 import torch_mpm as mpm
 from torch_mpm.heat.boundaries import Convection, Fixed, FixedSurface, Flux, FreeSurface, Radiation, Source, Surface
-from torch_mpm.parameters import PerMaterial
+from torch_mpm.laws.parameters import PerMaterial
 
 # ---- conduction
 

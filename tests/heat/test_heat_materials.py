@@ -7,7 +7,7 @@ from cases.heat import FLOAT, block, grid_around
 from helpers import relative_error
 
 import torch_mpm as mpm
-from torch_mpm.parameters import evaluate
+from torch_mpm.laws.parameters import evaluate
 
 KNOTS, VALUES = [0.0, 10.0, 50.0], [2e4, 1e4, 1e3]
 

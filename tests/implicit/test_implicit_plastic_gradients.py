@@ -12,9 +12,9 @@ from helpers import relative_error
 import torch_mpm as mpm
 from torch_mpm.implicit import Implicit, adjoint, equilibrium, implicit
 from torch_mpm.laws.compiled import CompiledLaw
+from torch_mpm.laws.parameters import Overlay
 from torch_mpm.ops import LAWS as REGISTRY
 from torch_mpm.ops.law import law_energy_gradient
-from torch_mpm.parameters import Overlay
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -11,8 +11,8 @@ import torch_mpm as mpm
 from torch_mpm.implicit import Implicit
 from torch_mpm.implicit.system import ImplicitSystem
 from torch_mpm.laws.flowing import flowing_stress, flowing_tangent
+from torch_mpm.laws.parameters import Overlay
 from torch_mpm.ops import implicit_apply
-from torch_mpm.parameters import Overlay
 
 LAWS = {
     "von_mises": mpm.VonMises(E=1e6, nu=0.3, yield_stress=2e4, hardening=1e5),

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import torch_mpm as mpm
-from torch_mpm import shapes
+from torch_mpm.geometry import shapes
 from torch_mpm.meshes import closed
 
 trimesh = pytest.importorskip("trimesh")

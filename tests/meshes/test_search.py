@@ -5,7 +5,7 @@ import pytest
 import torch
 
 import torch_mpm as mpm
-from torch_mpm import shapes
+from torch_mpm.geometry import shapes
 from torch_mpm.meshes import nearest, winding
 
 trimesh = pytest.importorskip("trimesh")

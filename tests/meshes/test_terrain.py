@@ -5,8 +5,8 @@ import pytest
 import torch
 
 import torch_mpm as mpm
-from torch_mpm import shapes
 from torch_mpm.boundaries import Obstacle
+from torch_mpm.geometry import shapes
 
 trimesh = pytest.importorskip("trimesh")
 from torch_mpm.meshes import terrain  # noqa: E402

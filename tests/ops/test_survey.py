@@ -7,9 +7,9 @@ import torch
 
 import torch_mpm as mpm
 from tests.helpers import TOLERANCE
-from torch_mpm.cfl import figures_of
 from torch_mpm.ops import survey
 from torch_mpm.reference import cfl as reference
+from torch_mpm.step.stability import figures_of
 
 F64 = torch.float64
 BOUND = 4 / 0.125**2

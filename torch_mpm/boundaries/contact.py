@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..vectors import norm
+from ..geometry.vectors import norm
 
 
 def contact_change(relative: Tensor, normal: Tensor, kind: str, friction: float | Tensor) -> Tensor:

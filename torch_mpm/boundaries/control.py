@@ -20,13 +20,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..capture import Remembered, as_remembered, is_captured, is_same, is_traced
-from ..per_scene import filled, finite
-from ..vectors import composed, norm
+from ..cuda_graphs.capture import Remembered, as_remembered, is_captured, is_same, is_traced
+from ..geometry.per_scene import filled, finite
+from ..geometry.vectors import composed, norm
 from .motion import PACE, RigidMotion
 
 if TYPE_CHECKING:
-    from ..state import State
+    from ..state.state import State
     from .obstacles import Obstacle
 
 ASSIGNED = ("position", "velocity", "rotation", "angular_velocity")
@@ -310,7 +310,7 @@ def obstacles_of(step: Any) -> Sequence[Obstacle]:
 @functools.cache
 def _classes() -> tuple[Any, Any]:
     """Which import this module."""
-    from ..step import Step
+    from ..step.step import Step
     from .obstacles import Obstacle
 
     return Step, Obstacle

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from ..errors import shape_of
-from ..per_scene import SceneParameters, Value, finite, floats, per_node
-from ..vectors import norm, transform
+from ..geometry.per_scene import SceneParameters, Value, finite, floats, per_node
+from ..geometry.vectors import norm, transform
 from .waypoints import Waypoints
 
 Path = Callable[[Tensor], "Tensor | Sequence[Any] | np.ndarray"]

@@ -11,18 +11,18 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch
 from torch import Tensor
 
-from .. import shapes
-from ..capture import GraphCache
+from ..cuda_graphs.capture import GraphCache
 from ..errors import check_count, check_number, shape_of
-from ..per_scene import Value, finite, per_node
-from ..shapes import Shape
-from ..vectors import transform
+from ..geometry import shapes
+from ..geometry.per_scene import Value, finite, per_node
+from ..geometry.shapes import Shape
+from ..geometry.vectors import transform
 from .contact import contact_change
 from .motion import Path, Pose, RigidMotion, to_body
 from .walls import CONTACTS
 
 if TYPE_CHECKING:
-    from ..state import State
+    from ..state.state import State
     from .control import Course
 
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from ..errors import check_numbers, shape_of
-from ..parameters import check_knots, store
+from ..laws.parameters import check_knots, store
 
 
 class Waypoints(nn.Module):

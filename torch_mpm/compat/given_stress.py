@@ -8,8 +8,8 @@ from torch import Tensor
 from ..errors import check_like
 from ..laws import Material
 from ..precision import from_half
-from ..state import State
-from ..step import Step
+from ..state.state import State
+from ..step.step import Step
 
 
 class GivenStress(Material):

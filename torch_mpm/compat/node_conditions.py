@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from ..boundaries import Box, Obstacle, Plane
-from ..parameters import TensorModule
+from ..laws.parameters import TensorModule
 from .gradients import Numbers
 
 

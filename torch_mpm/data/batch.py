@@ -10,12 +10,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..grid.topology import Status
 from ..laws import Mixture
 from ..rollouts import rollout
 from ..scene import fields, heap
 from ..scene.build import Built
-from ..state import State, _take_all
-from ..topology import Status
+from ..state.state import State, _take_all
 from .recording import Array, Recorded, Recording
 
 LOOK = 8

@@ -18,9 +18,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from .. import memory, optional
+from .. import optional
 from ..errors import DamagedFileError
 from ..files import check_file
+from . import host_memory
 
 Extents = Sequence[tuple[int, int]]
 """Parts of a file: (offset, length) [bytes]."""
@@ -37,7 +38,7 @@ HDF5_SPACE = 2**24
 
 
 def h5py_module() -> Any:
-    memory.require_address_space(HDF5_SPACE, "a file in HDF5")
+    host_memory.require_address_space(HDF5_SPACE, "a file in HDF5")
     return optional.load("h5py", "trajectories", "data")
 
 
@@ -231,8 +232,8 @@ def unreadable(path: Path, problem: str, error: BaseException, remedy: str, inta
     """
     if not intact():
         return DamagedFileError(path, f"{problem} ({error})", remedy)
-    if memory.is_short(error):
-        return MemoryError(f"{path}: {problem}, {memory.shortage(error)}")
+    if host_memory.is_short(error):
+        return MemoryError(f"{path}: {problem}, {host_memory.shortage(error)}")
     return DamagedFileError(path, f"{problem} ({error}), though its checksum is right", INTACT)
 
 
@@ -274,7 +275,7 @@ def _foreign(h5py: Any, file: Any, size: int) -> str:
                 return f"{name!r} is larger than the file"
         dict(file.attrs)
     except READ_ERRORS as error:
-        if memory.is_short(error):
+        if host_memory.is_short(error):
             raise
         return f"it cannot be read ({error})"
     return ""

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ..grid import Grid
+from ..grid.grid import Grid
+from ..grid.topology import PADDING
 from ..ops import p2g
-from ..topology import PADDING
 
 CELLS_AT_ONCE = 2**22
 

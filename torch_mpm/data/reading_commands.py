@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from ..view_server import MOST_PORT
+from ..render.viewer_server import MOST_PORT
 from .commands import folder_argument, path_argument
 from .folder import DATASET, DatasetError
 
@@ -147,7 +147,7 @@ def _stats(options: argparse.Namespace) -> None:
 
 
 def _view(options: argparse.Namespace) -> None:
-    from ..view import Viewer
+    from ..render.viewer import Viewer
 
     viewer = Viewer(options.folder, options.port, options.host)
     try:

@@ -17,10 +17,10 @@ import torch
 from pydantic import TypeAdapter, ValidationError
 from torch import Tensor
 
-from .. import shapes
+from ..geometry import shapes
+from ..geometry.seed import Region
 from ..scene import schema
 from ..scene.places import obstacle, region
-from ..seed import Region
 from .configuration import Configuration
 from .distribution import Words, sample
 

@@ -18,19 +18,19 @@ import torch
 from torch import Tensor
 
 from ..boundaries import Obstacle
-from ..bspline import base_node, bspline
 from ..errors import NUMBER_OR_TENSOR, check_number, check_real, shape_of
-from ..grid import Blocks
+from ..geometry.per_scene import per_node
+from ..grid.bspline import base_node, bspline
+from ..grid.grid import Blocks
+from ..grid.topology import PADDING
 from ..laws.compiled import check_value
+from ..laws.parameters import TensorModule, Value, evaluate, needs_no_scenes
 from ..ops import scatter
 from ..ops.pointwise import pointwise
-from ..parameters import TensorModule, Value, evaluate, needs_no_scenes
-from ..per_scene import per_node
-from ..step_times import time_like
-from ..topology import PADDING
+from ..step.clocks import time_like
 
 if TYPE_CHECKING:
-    from ..state import State
+    from ..state.state import State
 
 FROM_TIME = "what a function of the time returns"
 STEFAN_BOLTZMANN = 5.670374419e-8

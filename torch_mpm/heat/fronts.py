@@ -8,7 +8,7 @@ import warnings
 import torch
 from torch import Tensor
 
-from ..capture import outside_transforms, without_transforms
+from ..cuda_graphs.capture import outside_transforms, without_transforms
 from ..errors import FrontWarning
 
 LARGEST = 1.0

@@ -27,24 +27,24 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor, nn
 
-from ..activation_record import ActivationRecord
 from ..boundaries import BoundaryList
 from ..boundaries.control import control_step
-from ..capture import outside_transforms, without_transforms
+from ..cuda_graphs.capture import outside_transforms, without_transforms
 from ..errors import check_like, check_number
-from ..failures import Failures, Problem, raise_failures, unsolved_heat
-from ..grid import Blocks, Grid, check_grid
+from ..geometry.vectors import determinant
+from ..grid.grid import Blocks, Grid, check_grid
 from ..laws.compiled import check_value
+from ..laws.parameters import Value, check_length, evaluate, needed_temperature, store
 from ..laws.thermal import LIQUID
 from ..ops import gather, heat_cg, scatter
 from ..ops.arguments import check_choice, per_particle
 from ..ops.heat import METHODS
 from ..ops.pointwise import pointwise
-from ..parameters import Value, check_length, evaluate, needed_temperature, store
-from ..pause import paused
-from ..state import State, check_state
-from ..step_times import time_after
-from ..vectors import determinant
+from ..state.state import State, check_state
+from ..step.clocks import time_after
+from ..step.failures import Failures, Problem, raise_failures, unsolved_heat
+from ..step.pause import paused
+from ..step.status import ActivationRecord
 from .boundaries import FixedSurface, HeatNodes
 from .fronts import FrontRecord
 

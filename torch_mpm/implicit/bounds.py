@@ -12,8 +12,8 @@ from torch import Tensor
 
 from ..boundaries import Obstacle, Walls
 from ..boundaries.walls import Face
-from ..grid import Blocks
-from ..vectors import product
+from ..geometry.vectors import product
+from ..grid.grid import Blocks
 from .mirrors import reflected_inside
 
 ON_FACE = 1e-6

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 
 from ..errors import check_number
-from ..parameters import Overlay
+from ..laws.parameters import Overlay
 
 if TYPE_CHECKING:
-    from ..state import State
-    from ..step import Step
+    from ..state.state import State
+    from ..step.step import Step
 
 MOVED = 0.05
 """Displacement per implicit step as a share of dx with an error of about 2%, as in a gripper that squeezes rubber

@@ -9,8 +9,8 @@ import torch
 from ..errors import check_number
 
 if TYPE_CHECKING:
-    from ..state import State
-    from ..step import Step
+    from ..state.state import State
+    from ..step.step import Step
 
 
 def equilibrium(step: Step, state: State, dt: float) -> State:

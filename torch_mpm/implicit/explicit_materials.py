@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from ..errors import check_count, shape_of
-from ..grid import Blocks, Grid
+from ..grid.grid import Blocks, Grid
 from ..laws.material import Material
 from ..laws.mixture import Mixture
 from ..ops import scatter

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..capture import is_captured, is_traced, outside_transforms, without_transforms
+from ..cuda_graphs.capture import is_captured, is_traced, outside_transforms, without_transforms
 from ..errors import check_count, check_number
-from ..failures import Problem, unsolved_steps
 from ..laws.material import Material
 from ..laws.mixture import Mixture
 from ..ops import grid_update
+from ..step.failures import Problem, unsolved_steps
 from .adjoint import differentiable
 from .bounds import node_bounds
 from .explicit_materials import checked_materials, solved_materials, solved_nodes
@@ -25,9 +25,9 @@ from .newton import Minimum, Options, minimise
 from .system import ImplicitSystem
 
 if TYPE_CHECKING:
-    from ..grid import Blocks
-    from ..state import State
-    from ..step import Step
+    from ..grid.grid import Blocks
+    from ..state.state import State
+    from ..step.step import Step
 
 
 class ImplicitReport(NamedTuple):

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ..boundaries import Walls
 from ..boundaries.walls import Face
-from ..grid import Blocks
+from ..grid.grid import Blocks
 from ..ops.grid_update_composed import images
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from torch import Tensor
 
-from ..parameters import Overlay
+from ..laws.parameters import Overlay
 
 
 @dataclasses.dataclass(frozen=True)

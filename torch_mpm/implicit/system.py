@@ -16,11 +16,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..grid import Blocks
+from ..grid.grid import Blocks
 from ..laws.material import Material
+from ..laws.parameters import Overlay
 from ..ops import advance, gather, implicit_apply, implicit_node_blocks, scatter
 from ..ops.arguments import per_particle, sum_by_scene
-from ..parameters import Overlay
 from .mirrors import Mirrors
 
 READ = ("x", "mass", "volume", "F", "J", "scene", "ids", "material", "temperature", "time", "dt", "particles", "scenes")

@@ -9,12 +9,12 @@ from torch import Tensor
 
 from ..errors import check_vector, shape_of
 from ..ops.law import law_energy, law_stiffness, law_update, law_wave_modulus
-from ..particle_operations import of_particles
+from ..step.particle_operations import of_particles
 from .custom import as_law
 from .material import Material
 
 if TYPE_CHECKING:
-    from ..state import State
+    from ..state.state import State
 
 __all__ = ["Active"]
 

@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from ..capture import GraphCache, is_traced
+from ..cuda_graphs.capture import GraphCache, is_traced
 from ..errors import check_number, shape_of
+from ..geometry.vectors import product
 from ..ops.arguments import refuse_batched, soa_empty
 from ..ops.implicit import add_deviator
 from ..ops.law import (
@@ -31,13 +32,12 @@ from ..ops.law import (
     option_bits,
 )
 from ..ops.registry import LAWS
-from ..parameters import Overlay, PerMaterial, Value, check_length, evaluate, needs_no_scenes
-from ..vectors import product
 from .flowing import flowing_skew, flowing_stress, flowing_tangent
 from .material import Material
+from .parameters import Overlay, PerMaterial, Value, check_length, evaluate, needs_no_scenes
 
 if TYPE_CHECKING:
-    from ..state import State
+    from ..state.state import State
 
 
 PLASTIC_VOLUME = "log_plastic_volume"

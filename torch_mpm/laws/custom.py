@@ -15,7 +15,7 @@ from .isotropic import isotropic
 from .material import Material
 
 if TYPE_CHECKING:
-    from ..state import State
+    from ..state.state import State
 
 __all__ = ["CustomLaw", "CustomPrincipalLaw", "isotropic"]
 

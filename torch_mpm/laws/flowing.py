@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from ..geometry.vectors import determinant
 from ..ops.autograd import graph_at_once
 from ..ops.svd import svd3
-from ..parameters import Overlay
-from ..vectors import determinant
+from .parameters import Overlay
 
 if TYPE_CHECKING:
     from .material import Material

@@ -9,11 +9,11 @@ from torch import Tensor
 
 from ..ops.arguments import per_parameter
 from ..ops.registry import LAWS
-from ..parameters import Value
 from .compiled import CompiledLaw, check_value
+from .parameters import Value
 
 if TYPE_CHECKING:
-    from ..state import State
+    from ..state.state import State
 
 __all__ = ["WeaklyCompressible"]
 

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from ..vectors import determinant
+from ..geometry.vectors import determinant
 from .tangent import differentiated_stiffness
 
 if TYPE_CHECKING:
-    from ..state import State
+    from ..state.state import State
 
 
 class Material(nn.Module):

@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from ..capture import Remembered, without_transforms
+from ..cuda_graphs.capture import Remembered, without_transforms
 from ..errors import shape_of
 from ..ops.arguments import soa_empty
 from ..ops.implicit import tangent_entries
-from ..state import _take
+from ..state.state import _take
 from .custom import as_law
 from .material import Material
 
 if TYPE_CHECKING:
-    from ..state import State
+    from ..state.state import State
 
 __all__ = ["Mixture"]
 

@@ -9,17 +9,17 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from ..capture import GraphCache
+from ..cuda_graphs.capture import GraphCache
 from ..errors import check_flag, check_number
 from ..ops.arguments import per_parameter
 from ..ops.law import DISSIPATED, MULTIPLIER
 from ..ops.registry import LAWS
 from ..ops.sand import ANGLE, ENERGIES, friction_alpha, law_name
-from ..parameters import Value
 from .compiled import SolidLaw, check_value
+from .parameters import Value
 
 if TYPE_CHECKING:
-    from ..state import State
+    from ..state.state import State
 
 
 __all__ = ["QuarticSand"]

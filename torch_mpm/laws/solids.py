@@ -10,11 +10,11 @@ from torch import Tensor
 
 from ..ops.arguments import per_parameter
 from ..ops.law import law_energy
-from ..parameters import Value
 from .compiled import SolidLaw
+from .parameters import Value
 
 if TYPE_CHECKING:
-    from ..state import State
+    from ..state.state import State
 
 __all__ = [
     "CamClay",

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from ..ops.autograd import graph_at_once
-from ..parameters import Overlay
+from .parameters import Overlay
 
 if TYPE_CHECKING:
-    from ..state import State
+    from ..state.state import State
     from .material import Material
 
 

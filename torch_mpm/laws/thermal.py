@@ -10,13 +10,13 @@ from torch import Tensor
 
 from ..errors import check_number
 from ..ops.pointwise import pointwise
-from ..parameters import Overlay, Value, check_length, evaluate, needed_temperature, store
 from .compiled import check_value
 from .custom import as_law
 from .material import Material
+from .parameters import Overlay, Value, check_length, evaluate, needed_temperature, store
 
 if TYPE_CHECKING:
-    from ..state import State
+    from ..state.state import State
 
 __all__ = ["Melting", "ThermalExpansion"]
 

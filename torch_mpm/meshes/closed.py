@@ -10,7 +10,7 @@ import numpy as np
 
 from .. import optional
 from ..files import check_file
-from ..surface_mesh import Array
+from ..geometry.surface_mesh import Array
 
 MERGED = 1e-5
 """Distance within which vertices on open edges are merged, in diagonals of the mesh."""

@@ -7,7 +7,7 @@ import functools
 import torch
 from torch import Tensor
 
-from ..surface_mesh import Array
+from ..geometry.surface_mesh import Array
 from .nearest import Tree
 from .winding import Columns
 

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..surface_mesh import Array
+from ..geometry.surface_mesh import Array
 
 POINTS, PAIRS = 2**14, 2**18
 """Number of points that are looked up together, and of point-box pairs, which bound the memory."""

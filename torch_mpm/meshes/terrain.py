@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..surface_mesh import Array
+from ..geometry.surface_mesh import Array
 from .closed import ClosedMesh, edge_uses, merged_equal, places
 
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..surface_mesh import Array
+from ..geometry.surface_mesh import Array
 
 PAIRS = 2**19
 """Number of line-triangle pairs that are computed together, which bounds the memory."""

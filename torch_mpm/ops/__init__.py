@@ -15,15 +15,7 @@ from .grid_update import grid_update
 from .heat import HeatSolve, heat_cg, heat_operator
 from .implicit import ImplicitSolve, implicit_apply, implicit_cg, implicit_node_blocks
 from .impulses import contact_impulses, wall_impulses
-from .law import (
-    LawUpdate,
-    law_energy,
-    law_energy_gradient,
-    law_stiffness,
-    law_tangent,
-    law_update,
-    law_wave_modulus,
-)
+from .law import LawUpdate, law_energy, law_energy_gradient, law_stiffness, law_tangent, law_update, law_wave_modulus
 from .registry import LAWS
 from .sand import quartic_energy, quartic_return_map, quartic_stiffness, quartic_stress
 from .survey import Survey, survey

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..capture import is_traced
+from ..cuda_graphs.capture import is_traced
 from ..errors import LARGEST, REAL, check_like, shape_of
 
 

@@ -10,7 +10,7 @@ from torch._functorch.utils import enable_single_level_autograd_function
 from torch.autograd import forward_ad
 from torch.autograd.graph import saved_tensors_hooks
 
-from ..topology import PackedTopology
+from ..grid.topology import PackedTopology
 
 _transformed = torch._C._are_functorch_transforms_active
 _LIBRARY = torch.library.Library("torch_mpm", "IMPL")

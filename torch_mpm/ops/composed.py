@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..bspline import base_node, bspline, bspline_derivative
-from ..topology import PADDING, Topology
+from ..grid.bspline import base_node, bspline, bspline_derivative
+from ..grid.topology import PADDING, Topology
 
 
 def trilinear_form(

@@ -18,13 +18,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .. import shapes
 from ..boundaries import Obstacle
 from ..errors import FLOATING, NUMBER_OR_TENSOR, check_number, shape_of
-from ..grid import Blocks, check_blocks
-from ..parameters import has_hooks
-from ..step_times import StepTimes
-from ..topology import Topology
+from ..geometry import shapes
+from ..grid.grid import Blocks, check_blocks
+from ..grid.topology import Topology
+from ..laws.parameters import has_hooks
+from ..step.clocks import StepTimes
 from .arguments import check_list, differentiate, refuse_vmap, sizes
 from .autograd import dispatch, register_autograd, save_with_topology, saved_with_topology
 from .grid_update import CONTACT_KINDS, CONTACT_NAMES, sum_by_scene_of_blocks

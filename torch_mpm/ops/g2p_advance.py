@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from ..errors import check_flag, check_like, check_particles
-from ..grid import Blocks, check_blocks
-from ..topology import Topology
+from ..grid.grid import Blocks, check_blocks
+from ..grid.topology import Topology
 from .arguments import check_choice, refuse_vmap, sizes, soa_empty, split_dt, sum_by_scene
 from .autograd import dispatch, register_autograd, save_with_topology, saved_with_topology
 from .transfer import STRESS_FORMS, _check_nodes

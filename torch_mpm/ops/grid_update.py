@@ -10,8 +10,8 @@ from torch import Tensor
 
 from ..boundaries import Face, Walls
 from ..errors import FLOATING, check_like, shape_of
-from ..grid import Blocks, check_blocks
-from ..topology import Topology
+from ..grid.grid import Blocks, check_blocks
+from ..grid.topology import Topology
 from .arguments import differentiate, refuse_vmap, sizes, split_dt
 from .autograd import dispatch, register_autograd, save_with_topology, saved_with_topology
 from .grid_update_composed import composed_grid_update

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ..boundaries.contact import contact_change
-from ..topology import PADDING, Topology
+from ..grid.topology import PADDING, Topology
 
 if TYPE_CHECKING:
     from ..boundaries import Face

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from ..errors import NUMBER_OR_TENSOR, check_like, check_number, check_particles, shape_of
-from ..grid import Blocks, check_blocks
-from ..topology import PackedTopology, Topology
+from ..grid.grid import Blocks, check_blocks
+from ..grid.topology import PackedTopology, Topology
 from .arguments import check_choice, refuse_vmap, split_dt
 from .autograd import dispatch, register_autograd, save_with_topology, saved_with_topology
 from .heat_multigrid import heat_multigrid

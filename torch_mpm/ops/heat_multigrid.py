@@ -16,11 +16,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..bspline import bspline
-from ..capture import is_captured
+from ..cuda_graphs.capture import is_captured
 from ..errors import check_like, shape_of
-from ..grid import INT32_MAX, Grid
-from ..topology import BLOCK_WIDTH, PADDING, Topology
+from ..grid.bspline import bspline
+from ..grid.grid import INT32_MAX, Grid
+from ..grid.topology import BLOCK_WIDTH, PADDING, Topology
 from .heat_patches import Patches, lattice_rows
 
 DEGREE, COARSE_DEGREE = 4, 2

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..topology import BLOCK_WIDTH, Topology, unravel
+from ..grid.topology import BLOCK_WIDTH, Topology, unravel
 from .arguments import refuse_vmap, sizes
 from .autograd import register_autograd
 

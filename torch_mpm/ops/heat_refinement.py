@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from ..grid import Blocks
+from ..grid.grid import Blocks
 
 REFINEMENTS = 3
 REDUCTION = 1e-4

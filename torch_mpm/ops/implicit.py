@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from ..errors import check_count, check_like, check_particles, shape_of
-from ..grid import Blocks, check_blocks
-from ..topology import Topology
+from ..grid.grid import Blocks, check_blocks
+from ..grid.topology import Topology
 from .arguments import check_choice, refuse_vmap, sizes
 from .autograd import dispatch, register_autograd
 from .transfer import STRESS_FORMS

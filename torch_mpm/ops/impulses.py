@@ -15,8 +15,8 @@ from torch import Tensor
 
 from ..boundaries import Face, Obstacle, Walls
 from ..errors import check_like
-from ..grid import Blocks
-from ..topology import Topology
+from ..grid.grid import Blocks
+from ..grid.topology import Topology
 from .arguments import differentiate, refuse_vmap, sizes
 from .autograd import dispatch, register_autograd, save_with_topology, saved_with_topology
 from .contact import (

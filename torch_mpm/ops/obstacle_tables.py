@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from .. import shapes
 from ..boundaries.obstacles import Obstacle
-from ..per_scene import SceneParameters
-from ..step_times import StepTimes
+from ..geometry import shapes
+from ..geometry.per_scene import SceneParameters
+from ..step.clocks import StepTimes
 
 
 class KernelShape(NamedTuple):

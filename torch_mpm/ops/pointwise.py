@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from .. import _library
-from ..capture import is_traced
+from ..cuda_graphs.capture import is_traced
 from ..errors import FLOATING
 from .arguments import refuse_vmap, soa_empty
 from .autograd import dispatch, is_recorded, register_autograd

@@ -14,8 +14,8 @@ from .contact import obstacle_arguments, time_arguments
 
 if TYPE_CHECKING:
     from ..boundaries import Obstacle
-    from ..grid import Grid
-    from ..state import State
+    from ..grid.grid import Grid
+    from ..state.state import State
 
 
 class Survey(NamedTuple):

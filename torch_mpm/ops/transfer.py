@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from ..errors import check_flag, check_like, check_number, check_particles, shape_of
-from ..grid import Blocks, check_blocks
-from ..topology import Topology
+from ..grid.grid import Blocks, check_blocks
+from ..grid.topology import Topology
 from . import composed
 from .arguments import check_choice, differentiate, per_particle, refuse_vmap, sizes, soa_empty, split_dt, sum_by_scene
 from .autograd import dispatch, register_autograd, save_with_topology, saved_with_topology

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..grid import Blocks
+from ..grid.grid import Blocks
 from . import transfer
 
 

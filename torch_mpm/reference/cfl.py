@@ -7,8 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-from ..grid import Grid
-from ..state import State
+from ..grid.grid import Grid
+from ..state.state import State
 
 LARGEST_CHANGE = 0.5
 """Maximum relative change of a stretch or of the volume of a particle in one step."""

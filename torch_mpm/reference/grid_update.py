@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from ..topology import BLOCK_WIDTH, PADDING
+from ..grid.topology import BLOCK_WIDTH, PADDING
 from .contact import contact_velocity
 
 if TYPE_CHECKING:
     from ..boundaries import Face
-    from ..topology import Topology
+    from ..grid.topology import Topology
 
 MIRROR_REACH = 2
 """Nodes on both sides of a mirror that have images (csrc/grid/grid_update.h)."""

@@ -7,7 +7,7 @@ import dataclasses
 import torch
 from torch import Tensor
 
-from ..grid import Blocks
+from ..grid.grid import Blocks
 from .transfer import Support, support
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from ..topology import Topology
+from ..grid.topology import Topology
 from . import transfer
 
 

@@ -12,7 +12,7 @@ from .grid_update import grid_update
 
 if TYPE_CHECKING:
     from ..boundaries import Face
-    from ..topology import Topology
+    from ..grid.topology import Topology
 
 
 def moments(blocks: Topology, momentum: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ import math
 import torch
 from torch import Tensor
 
-from ..topology import BLOCK_WIDTH, PADDING, Topology
+from ..grid.topology import BLOCK_WIDTH, PADDING, Topology
 
 
 def bspline(distance: Tensor, order: int) -> Tensor:

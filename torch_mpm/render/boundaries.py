@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..surface_mesh import Array, SurfaceMesh
+from ..geometry.surface_mesh import Array, SurfaceMesh
 from .cloud import contour
 from .colors import numpy_of
 from .requires import require

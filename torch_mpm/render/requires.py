@@ -5,7 +5,8 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-from .. import memory, optional
+from .. import optional
+from ..data import host_memory
 
 SIZES = {"vtk": 7e8, "vtkmodules": 7e8, "matplotlib": 2e8}
 """Maximum memory of the import of a package [bytes]: VTK and kiwisolver end the process where it fails."""
@@ -27,7 +28,7 @@ def require(module: str) -> Any:
     """
     package = module.partition(".")[0]
     if package in SIZES and package not in sys.modules:
-        memory.require(SIZES[package], f"the import of {package} for pictures")
+        host_memory.require(SIZES[package], f"the import of {package} for pictures")
         if package.startswith("vtk"):
-            memory.require_address_space(VTK_SPACE, "a picture by vtk")
+            host_memory.require_address_space(VTK_SPACE, "a picture by vtk")
     return optional.load(module, "pictures", "render")

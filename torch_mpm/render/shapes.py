@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from .. import surface_mesh
-from ..surface_mesh import Array, SurfaceMesh, frame_of
+from ..geometry import surface_mesh
+from ..geometry.surface_mesh import Array, SurfaceMesh, frame_of
 
 GREY = (0.62, 0.64, 0.68)
 

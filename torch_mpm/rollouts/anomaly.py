@@ -8,9 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..failures import NAMED
-from ..grid import Grid
-from ..state import State
+from ..grid.grid import Grid
+from ..state.state import State
+from ..step.failures import NAMED
 
 
 def detecting() -> bool:

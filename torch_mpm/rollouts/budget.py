@@ -8,8 +8,8 @@ from collections.abc import Callable
 
 from torch import Tensor
 
-from ..state import State
-from ..step import Step
+from ..state.state import State
+from ..step.step import Step
 from .checkpoints import Checkpoints, fitting
 from .memory import state_bytes, step_bytes
 

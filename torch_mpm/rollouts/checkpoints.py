@@ -13,11 +13,11 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree
 
-from ..activation_record import aside, uncounted
 from ..boundaries.control import motions_of
 from ..errors import check_count, check_flag, check_number
-from ..grid import same_pools
-from ..state import State
+from ..grid.grid import same_pools
+from ..state.state import State
+from ..step.status import aside, uncounted
 from .recompute import called_again
 
 Advance = Callable[[State, int, int], State]

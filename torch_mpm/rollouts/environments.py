@@ -23,12 +23,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..boundaries.impulses import Impulses
 from ..errors import check_count, shape_of
-from ..impulses import Impulses
 from ..ops.arguments import split_dt
-from ..pause import standing
-from ..state import PARTICLE_FIELDS, State, check_state
-from ..step import Step
+from ..state.state import PARTICLE_FIELDS, State, check_state
+from ..step.pause import standing
+from ..step.step import Step
 from .run import rollout
 
 ABSENT = -1

@@ -8,11 +8,11 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from ..activation_record import aside
+from ..data.host_memory import in_words
 from ..errors import check_count, shape_of
-from ..memory import in_words
-from ..state import State
-from ..step import Step
+from ..state.state import State
+from ..step.status import aside
+from ..step.step import Step
 from .budget import EVERYTHING, bytes_kept
 from .checkpoints import Checkpoints, as_checkpoints
 from .hooks import Parts

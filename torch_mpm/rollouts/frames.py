@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from ..errors import check_count, shape_of
-from ..state import State, check_state
-from ..step import Step
+from ..state.state import State, check_state
+from ..step.step import Step
 from .checkpoints import Checkpoints
 from .hooks import Hook, Parts
 from .run import rollout

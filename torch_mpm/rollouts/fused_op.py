@@ -9,19 +9,19 @@ import torch
 from torch import Tensor
 
 from ..errors import check_count, check_flag, shape_of
+from ..grid.topology import Status
 from ..laws.calls import law_calls
+from ..laws.parameters import Overlay
 from ..ops.autograd import dispatch
 from ..ops.contact import obstacle_arguments
 from ..ops.grid_update import per_scene, wall_arguments
 from ..ops.substeps import ARGUMENTS
 from ..ops.transfer import STRESS_FORMS
-from ..parameters import Overlay
-from ..pause import paused
 from ..signals import interruptible
-from ..state import State, check_state
-from ..step import Step
-from ..step_times import StepTimes, clocks, requires_grad, time_after
-from ..topology import Status
+from ..state.state import State, check_state
+from ..step.clocks import StepTimes, clocks, requires_grad, time_after
+from ..step.pause import paused
+from ..step.step import Step
 from .checkpoints import binomial, offloaded
 from .plan import SCHEDULES, RolloutPlan, differentiates, follows_paths, why_not_fused
 from .sorting import STEPS_IN_ORDER, put_back, put_in_order

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..errors import check_count, check_number
 from ..ops.arguments import sum_by_scene
-from ..state import State
+from ..state.state import State
 
 MOVED = ("x", "v", "C", "F", "J", "temperature")
 """Fields that steps change, beside history."""

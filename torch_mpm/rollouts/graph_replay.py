@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from ..graphs import Replays, WorkInFlight, time_tensor
-from ..state import State
-from ..step import Step
-from ..step_times import time_after
+from ..cuda_graphs.graph import Replays, WorkInFlight, time_tensor
+from ..state.state import State
+from ..step.clocks import time_after
+from ..step.step import Step
 
 LEAST_STEPS = 6
 """For which a step is recorded: that takes the host as long as one or two steps."""

@@ -14,18 +14,18 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from ..activation_record import counts_of, uncounted
 from ..boundaries.control import control_step, steady
-from ..capture import Recordings, Same, capturing
+from ..cuda_graphs.capture import Recordings, Same, capturing
+from ..cuda_graphs.graph import WorkInFlight, copied, copy_all, tensors_of, time_tensor
+from ..cuda_graphs.keys import StepKey, autocast_of, surroundings
 from ..errors import check_count, shape_of
-from ..graphs import WorkInFlight, copied, copy_all, tensors_of, time_tensor
-from ..grid import own_pools
+from ..grid.grid import own_pools
 from ..laws.mixture import Mixture
-from ..parameters import has_hooks
-from ..recording_keys import StepKey, autocast_of, surroundings
-from ..state import State, check_state
-from ..step import Step
-from ..step_times import time_after
+from ..laws.parameters import has_hooks
+from ..state.state import State, check_state
+from ..step.clocks import time_after
+from ..step.status import counts_of, uncounted
+from ..step.step import Step
 
 TRIALS = 3
 """Times that steps are taken from Python before they are recorded, as torch does: compilers of code of the user's look

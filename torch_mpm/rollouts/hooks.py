@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ..errors import check_count, shape_of
-from ..state import FIELDS, State
+from ..state.state import FIELDS, State
 from .gradient_norms import GradientNorms
 
 Control = Callable[[State, int], contextlib.AbstractContextManager[Callable[[State], State]]]

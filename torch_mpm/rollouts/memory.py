@@ -10,8 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..activation_record import aside
-from ..state import State
+from ..state.state import State
+from ..step.status import aside
 from .checkpoints import CONSTANT
 
 StepFunction = Callable[[State, "float | Tensor"], State]

@@ -12,24 +12,24 @@ import torch
 from torch import Tensor, nn
 
 from .._library import graph_loops
-from ..activation_record import ActivationRecord
 from ..boundaries import Obstacle
 from ..boundaries.obstacles import motion_tensors
-from ..capture import NUMBERS, GraphCache, Recordings, is_captured, is_of_library, is_traced, is_transformed
+from ..cuda_graphs.capture import NUMBERS, GraphCache, Recordings, is_captured, is_of_library, is_traced, is_transformed
+from ..cuda_graphs.graph import tensors_of
 from ..errors import check_count, shape_of
-from ..graphs import tensors_of
-from ..grid import Grid
+from ..grid.grid import Grid
 from ..laws import CompiledLaw
 from ..laws.active import Active
 from ..laws.calls import laws_of, passive
 from ..laws.custom import CustomLaw
+from ..laws.parameters import has_hooks
 from ..ops.arguments import check_choice
 from ..ops.contact import MAX_OBSTACLES, fusible
 from ..ops.obstacle_tables import numbers_of_a_step, path_requires_grad
-from ..parameters import has_hooks
-from ..state import State, check_state
-from ..step import Step
-from ..step_times import StepTimes, requires_grad
+from ..state.state import State, check_state
+from ..step.clocks import StepTimes, requires_grad
+from ..step.status import ActivationRecord
+from ..step.step import Step
 from . import graph_segments
 from .anomaly import detecting
 from .budget import EVERYTHING, resolved, steps_of_a_call

@@ -11,8 +11,8 @@ from torch import Tensor
 from ..boundaries.control import control_step
 from ..errors import check_count, shape_of
 from ..ops.arguments import split_dt
-from ..state import State, check_state
-from ..step import Step
+from ..state.state import State, check_state
+from ..step.step import Step
 from .anomaly import begin, detecting, watch
 from .budget import EVERYTHING, resolved
 from .checkpoints import Checkpoints, as_checkpoints, binomial, in_segments

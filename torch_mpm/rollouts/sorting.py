@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from ..laws import Mixture
-from ..state import PARTICLE_FIELDS, State, _take_all
-from ..step import Step
+from ..state.state import PARTICLE_FIELDS, State, _take_all
+from ..step.step import Step
 
 STEPS_IN_ORDER = 1024
 """Number of steps after which particles are sorted again."""

@@ -10,10 +10,10 @@ from torch import Tensor
 
 from ..boundaries.control import control_step
 from ..boundaries.motion import PACE
-from ..cfl import chosen_dt
 from ..errors import NUMBER_OR_TENSOR, check_count, check_number, shape_of
-from ..state import State
-from ..step import Step
+from ..state.state import State
+from ..step.stability import chosen_dt
+from ..step.step import Step
 from .checkpoints import Checkpoints
 from .fused_op import in_calls
 from .graph_replay import CHUNK, replay_all

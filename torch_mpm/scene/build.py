@@ -13,12 +13,13 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from .. import boundaries, laws, seed
-from ..grid import Grid
+from .. import boundaries, laws
+from ..geometry import seed
+from ..grid.grid import Grid
 from ..laws.sand import QuarticSand
 from ..laws.thermal import LIQUID
-from ..state import State
-from ..step import Step
+from ..state.state import State
+from ..step.step import Step
 from . import check, heat, schema
 from .explain import SceneError
 from .obstacles import obstacles

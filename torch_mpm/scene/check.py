@@ -14,9 +14,12 @@ import torch
 from pydantic import BaseModel
 from torch import Tensor
 
-from .. import boundaries, memory, resolution, seed
+from .. import boundaries
+from ..data import host_memory
 from ..files import check_file
-from ..grid import Grid
+from ..geometry import seed
+from ..grid import resolution
+from ..grid.grid import Grid
 from . import heat, schema
 from .places import obstacle, region, relative
 
@@ -285,13 +288,13 @@ def _size_problems(scene: Any, entries: Sequence[Any]) -> Iterator[str]:
                 counts[f"{entry.path}|{key}"] = _filling(shape.volume, len(shape.lower), _spacing(body, scene.grid))
         for key, words in entry.keyed("emitter") if scene.duration is not None else ():
             counts[f"{entry.path}|{key}"] = _poured(words, scene)
-    total, free = sum(counts.values()), memory.available()
+    total, free = sum(counts.values()), host_memory.available()
     if total <= seed.MOST and total * PARTICLE_BYTES <= free:
         return
     room = (
         f"{seed.MOST} can be numbered"
         if total > seed.MOST
-        else f"they take {memory.in_words(total * PARTICLE_BYTES)}, and {memory.in_words(free)} are free"
+        else f"they take {host_memory.in_words(total * PARTICLE_BYTES)}, and {host_memory.in_words(free)} are free"
     )
     key = max(counts, key=lambda name: counts[name]).partition("|")[2]
     yield (

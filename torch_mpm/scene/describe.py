@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..state import PARTICLE_FIELDS, State
+from ..state.state import PARTICLE_FIELDS, State
 from .build import Built
 from .run import Simulation, joined
 from .scene import Scene

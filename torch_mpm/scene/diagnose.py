@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from ..errors import SimulationError
-from ..state import State
-from ..step import Step
+from ..state.state import State
+from ..step.step import Step
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ from torch import Tensor
 
 from ..data.stress import MEASURES
 from ..laws.thermal import LIQUID
-from ..state import State
-from ..step import Step
+from ..state.state import State
+from ..step.step import Step
 
 RANKS = {
     **{"F": 2, "C": 2, "J": 0, "stress": 2, "cauchy_stress": 2, "kirchhoff_stress": 2, "out_of_plane_stress": 0},

@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from ..data.hdf5 import h5py_module
+from ..data.host_memory import in_words
 from ..data.trajectory import COMPLETE, PARTIAL, Layout, Trajectory, create
 from ..data.whole_files import check_inside, check_record, write_record
 from ..errors import DamagedFileError
 from ..files import check_file
-from ..memory import in_words
 from .scene import Scene
 
 RUN, CHECKPOINT, LAST_GOOD, LOCK = "run.json", "checkpoint.h5", "last_good.h5", "run.lock"

@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from .. import laws
-from ..grid import Grid
+from ..grid.grid import Grid
 from ..heat.boundaries import Convection, Fixed, FixedSurface, Flux, FreeSurface, Radiation, Surface
 from ..heat.heat import Heat
+from ..laws.parameters import PerMaterial, Table
 from ..laws.thermal import Melting, ThermalExpansion
-from ..parameters import PerMaterial, Table
 from . import schema
 from .obstacles import Together
 

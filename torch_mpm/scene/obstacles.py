@@ -13,9 +13,9 @@ from typing import Any
 
 import torch
 
-from .. import shapes
 from ..boundaries import Obstacle
-from ..shapes import Shape
+from ..geometry import shapes
+from ..geometry.shapes import Shape
 from .places import obstacle
 
 FAR = 1000.0

@@ -10,9 +10,10 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from .. import boundaries, seed, shapes
+from .. import boundaries
 from ..boundaries import Obstacle
-from ..shapes import Shape
+from ..geometry import seed, shapes
+from ..geometry.shapes import Shape
 from . import schema
 
 PLACES = ("lower", "upper", "center", "a", "b", "offset", "view")

@@ -15,15 +15,15 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..cfl import Figures
 from ..data.hdf5 import h5py_module
 from ..data.trajectory import PARTIAL, Layout, Trajectory, TrajectoryWriter
 from ..data.whole_files import remove_leftovers
 from ..errors import DamagedFileError, SimulationError
+from ..grid.topology import Status
 from ..laws import Mixture
 from ..rollouts import rollout
-from ..state import State, _take_all
-from ..topology import Status
+from ..state.state import State, _take_all
+from ..step.stability import Figures
 from . import checkpoint, fields, heap
 from .build import Built
 from .diagnose import SceneFailure, replay, wrong

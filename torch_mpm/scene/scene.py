@@ -13,7 +13,7 @@ from pydantic import PrivateAttr, ValidationError
 
 from ..data.stress import MEASURES
 from ..files import read_text
-from ..seed import on_host
+from ..geometry.seed import on_host
 from . import check, partial, schema
 from .build import Built, build
 from .entry import ResolvedEntry

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from ..state import State
+from ..state.state import State
 from .build import Built
 from .explain import SceneError
 from .scene import Scene

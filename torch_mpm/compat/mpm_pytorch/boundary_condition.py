@@ -10,9 +10,9 @@ import torch
 from torch import Tensor, nn
 
 from ...boundaries import Plane
-from ...parameters import TensorModule
-from ...particle_operations import Hold, Push, Timed
-from ...state import State
+from ...laws.parameters import TensorModule
+from ...state.state import State
+from ...step.particle_operations import Hold, Push, Timed
 from ..gradients import Numbers, refuse_grad, vector
 from ..keys import check_keys
 from ..node_conditions import stopping_plane, surface_margin

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.multiprocessing.reductions import StorageWeakRef
 
-from ...capture import is_traced, version
+from ...cuda_graphs.capture import is_traced, version
 
 Moment = tuple[float, int]
 """Time [s], and number of changes of the conditions."""

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from ...errors import check_count, check_like, check_number, shape_of
-from ...grid import Grid
-from ...particle_operations import Operations
-from ...step import Step
+from ...grid.grid import Grid
+from ...step.particle_operations import Operations
+from ...step.step import Step
 from ..given_stress import GivenStress, clamped, stepped
 from ..gradients import Numbers, refuse_grad, vector
 from ..node_conditions import NodeDamping

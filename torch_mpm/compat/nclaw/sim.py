@@ -10,10 +10,10 @@ from torch import Tensor, nn
 
 from ...boundaries import Walls
 from ...errors import check_count, check_number, shape_of
-from ...grid import Blocks, Grid
-from ...parameters import TensorModule
-from ...state import State
-from ...step import Step
+from ...grid.grid import Blocks, Grid
+from ...laws.parameters import TensorModule
+from ...state.state import State
+from ...step.step import Step
 from ..given_stress import GivenStress, clamped, stepped
 from ..gradients import Numbers, refuse_grad, vector
 from ..settings import setting

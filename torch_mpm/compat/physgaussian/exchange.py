@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ...ops.svd import polar
-from ...state import State
+from ...state.state import State
 
 
 class Exchange:

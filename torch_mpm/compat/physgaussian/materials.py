@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from ...geometry.vectors import norm
 from ...laws import FixedCorotated, Material, QuarticSand, isotropic
-from ...parameters import evaluate, store
-from ...vectors import norm
+from ...laws.parameters import evaluate, store
 from .parameters import check_gradients, check_material
 
 if TYPE_CHECKING:
-    from ...state import State
+    from ...state.state import State
 
 LEAST_STRETCH = 0.01
 """Lower bound of a stretch in logarithms."""

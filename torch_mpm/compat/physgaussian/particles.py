@@ -7,8 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-from ...particle_operations import Timed
-from ...state import State
+from ...state.state import State
+from ...step.particle_operations import Timed
 from ..gradients import Numbers
 from ..selections import in_box
 

@@ -12,12 +12,12 @@ from torch import Tensor
 
 from ...boundaries import Obstacle
 from ...errors import check_count, check_like, check_number, shape_of
-from ...grid import Grid
+from ...grid.grid import Grid
 from ...laws import Material
-from ...particle_operations import Hold, Operations, Push, Timed
 from ...rollouts import rollout
-from ...state import State, identity_deformation
-from ...step import Step
+from ...state.state import State, identity_deformation
+from ...step.particle_operations import Hold, Operations, Push, Timed
+from ...step.step import Step
 from ..gradients import Numbers, refuse_grad, vector
 from ..keys import check_keys, check_needed
 from ..node_conditions import FreezeOutside, NodeDamping, moving_cuboid, outer_planes, stopping_plane, surface_margin

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...memory import in_words
 from ..folder import DatasetError, DatasetFolder
+from ..host_memory import in_words
 from ..metadata import metadata, write_metadata
 from ..statistics import BOUNDARY
 from ..stress import explicit_name

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from .errors import GridOverflowError, SimulationError
-from .state import PARTICLE_FIELDS, State
-from .topology import SceneStatus, Status
+from ..errors import GridOverflowError, SimulationError
+from ..grid.topology import SceneStatus, Status
+from ..state.state import PARTICLE_FIELDS, State
 
 if TYPE_CHECKING:
-    from .grid import Grid
-    from .laws.material import Material
+    from ..grid.grid import Grid
+    from ..laws.material import Material
 
 NAMED = 12
 """Number of scenes that a message names for each kind of problem."""

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from .errors import PrecisionWarning
+from ..errors import PrecisionWarning
 
 if TYPE_CHECKING:
     from .grid import Grid

@@ -39,16 +39,16 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .boundaries import Obstacle
-from .errors import NUMBER_OR_TENSOR, check_number, check_real, shape_of
-from .grid import Grid, check_grid
-from .laws.calls import law_calls, laws_of
-from .laws.compiled import CompiledLaw
-from .laws.custom import as_law
-from .laws.material import Material
-from .ops.arguments import check_choice
-from .ops.survey import Survey, law_figures, survey
-from .state import State, check_state
+from ..boundaries import Obstacle
+from ..errors import NUMBER_OR_TENSOR, check_number, check_real, shape_of
+from ..grid.grid import Grid, check_grid
+from ..laws.calls import law_calls, laws_of
+from ..laws.compiled import CompiledLaw
+from ..laws.custom import as_law
+from ..laws.material import Material
+from ..ops.arguments import check_choice
+from ..ops.survey import Survey, law_figures, survey
+from ..state.state import State, check_state
 
 GRADIENT_BOUND = {
     # Λ = dx² D⁻¹ of the MLS form: Σ_i N_i |D⁻¹ (x_i − x_p)|² per axis.

@@ -25,16 +25,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from . import memory, point_files, shapes
-from .errors import (
-    check_count,
-    check_device,
-    check_dtype,
-    check_number,
-    check_vector,
-    default_dtype,
-    shape_of,
-)
+from ..data import host_memory
+from ..errors import check_count, check_device, check_dtype, check_number, check_vector, default_dtype, shape_of
+from . import point_files, shapes
 from .shapes import Shape
 
 Vector = Sequence[float] | Tensor
@@ -315,8 +308,8 @@ def _check_size(shape: Region, spacing: float, method: str) -> None:
         cells *= (_POISSON_SPACING[len(sides)] * math.sqrt(len(sides))) ** len(sides)
     if points > MOST:
         room = f"{MOST} can be numbered"
-    elif cells * CELL_BYTES > FEW_BYTES and cells * CELL_BYTES > (free := memory.available()):
-        room = f"filling it takes {memory.in_words(cells * CELL_BYTES)}, and {memory.in_words(free)} are free"
+    elif cells * CELL_BYTES > FEW_BYTES and cells * CELL_BYTES > (free := host_memory.available()):
+        room = f"filling it takes {host_memory.in_words(cells * CELL_BYTES)}, and {host_memory.in_words(free)} are free"
     else:
         return
     raise ValueError(

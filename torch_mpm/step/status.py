@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from .capture import (
+from ..cuda_graphs.capture import (
     is_captured,
     is_exported,
     is_of_library,
@@ -20,12 +20,12 @@ from .capture import (
     remember,
     without_transforms,
 )
+from ..grid.grid import Blocks, Grid
+from ..grid.topology import COUNTS_OF_PROBLEMS, FIRST_PROBLEMS, Status
 from .failures import Problem, contradicted_poses, problems_of_first_state, problems_of_status, refused_steps
-from .grid import Blocks, Grid
-from .topology import COUNTS_OF_PROBLEMS, FIRST_PROBLEMS, Status
 
 if TYPE_CHECKING:
-    from .state import State
+    from ..state.state import State
 
 NO_PROBLEM = tuple(-1 if column in FIRST_PROBLEMS else 0 for column in Status)
 """Row of the status before the first activation (csrc/grid/status.h)."""

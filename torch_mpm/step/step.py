@@ -10,34 +10,35 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from . import locking, resolution
-from .activation_record import ActivationRecord
-from .boundaries import BoundaryList, Obstacle, Walls
-from .boundaries.control import control_step, motions_now
-from .capture import GraphCache, is_captured, is_traced, is_transformed
-from .cfl import Figures, chosen_dt, figures_of, look
-from .errors import REAL, PrecisionWarning, check_flag, check_number, check_vector, shape_of
+from ..boundaries import BoundaryList, Obstacle, Walls
+from ..boundaries.apply import after_boundaries
+from ..boundaries.control import control_step, motions_now
+from ..boundaries.impulses import Impulses, check_impulse, impulses_of, no_impulse
+from ..cuda_graphs.capture import GraphCache, is_captured, is_traced, is_transformed
+from ..errors import REAL, PrecisionWarning, check_flag, check_number, check_vector, shape_of
+from ..grid import resolution
+from ..grid.grid import Blocks, Grid, check_grid
+from ..heat.heat import Heat
+from ..implicit.comparison import compare
+from ..implicit.implicit import Implicit, ImplicitReport, as_integrator, check_explicit_materials, check_implicit
+from ..laws import locking
+from ..laws.custom import as_law
+from ..laws.material import Material
+from ..laws.mixture import Mixture
+from ..laws.parameters import Overlay, TensorModule
+from ..ops import Survey, fusible, g2p, gather, grid_update, p2g, wall_impulses
+from ..ops.arguments import check_choice, soa_empty, split_dt
+from ..ops.contact import MAX_OBSTACLES
+from ..ops.g2p_advance import g2p_advance_compensated
+from ..ops.transfer import STRESS_FORMS
+from ..precision import from_half, full_precision
+from ..state.state import State, check_state, identity_deformation
+from .clocks import time_after
 from .failures import Failures, problems_of_state, raise_failures
-from .grid import Blocks, Grid, check_grid
-from .heat.heat import Heat
-from .implicit.comparison import compare
-from .implicit.implicit import Implicit, ImplicitReport, as_integrator, check_explicit_materials, check_implicit
-from .impulses import Impulses, check_impulse, impulses_of, no_impulse
-from .laws.custom import as_law
-from .laws.material import Material
-from .laws.mixture import Mixture
-from .node_contact import after_boundaries
-from .ops import Survey, fusible, g2p, gather, grid_update, p2g, wall_impulses
-from .ops.arguments import check_choice, soa_empty, split_dt
-from .ops.contact import MAX_OBSTACLES
-from .ops.g2p_advance import g2p_advance_compensated
-from .ops.transfer import STRESS_FORMS
-from .parameters import Overlay, TensorModule
 from .particle_operations import ParticleOperation, operated
 from .pause import paused, standing
-from .precision import from_half, full_precision
-from .state import State, check_state, identity_deformation
-from .step_times import time_after
+from .stability import Figures, chosen_dt, figures_of, look
+from .status import ActivationRecord
 
 TRANSFERS = ("apic", "pic", "flip")
 
@@ -531,7 +532,7 @@ class Step(TensorModule):
         Raises:
             TypeError, ValueError, NotImplementedError: as `torch_mpm.implicit.compare`, for a speed.
         """
-        from .rollouts import plan_rollout  # which needs a Step
+        from ..rollouts import plan_rollout
 
         check_state(state)
         split_dt(dt, self.grid.scenes, state.x)

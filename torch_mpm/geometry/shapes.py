@@ -31,14 +31,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..cuda_graphs.capture import is_traced, is_transformed
+from ..errors import check_number, check_vector, shape_of
+from ..meshes import closed, terrain
+from ..meshes.index import MeshIndex
+from ..meshes.nearest import nearest_on_triangles
+from ..ops.autograd import graph_at_once
+from ..ops.pointwise import fuses, pointwise
 from . import surface_mesh
-from .capture import is_traced, is_transformed
-from .errors import check_number, check_vector, shape_of
-from .meshes import closed, terrain
-from .meshes.index import MeshIndex
-from .meshes.nearest import nearest_on_triangles
-from .ops.autograd import graph_at_once
-from .ops.pointwise import fuses, pointwise
 from .per_scene import SceneParameters, Value, constant, direction, extent, floats
 from .surface_mesh import Array, SurfaceMesh
 from .vectors import norm, unit

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from .ops.arguments import split_dt
+from ..ops.arguments import split_dt
 
 if TYPE_CHECKING:
-    from .state import State
+    from ..state.state import State
 
 
 def clocks(state: State, dt: float | Tensor, scenes: int) -> tuple[float, Tensor | None, Tensor | None]:

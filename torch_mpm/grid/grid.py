@@ -12,9 +12,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from . import resolution
-from .capture import is_captured, is_traced, outside_transforms
-from .errors import (
+from ..cuda_graphs.capture import is_captured, is_traced, outside_transforms
+from ..errors import (
     FLOATING,
     GridOverflowError,
     check_count,
@@ -25,6 +24,7 @@ from .errors import (
     check_vector,
     shape_of,
 )
+from . import resolution
 from .topology import BLOCK_WIDTH, PADDING, Lattice, Status, Topology
 
 INT32_MAX = 2**31 - 1

@@ -9,14 +9,14 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from .boundaries import Walls
-from .boundaries.motion import RigidMotion
+from ..boundaries import Walls
+from ..boundaries.motion import RigidMotion
+from ..grid.grid import Grid
+from ..laws.mixture import Mixture
+from ..laws.parameters import has_hooks
+from ..state.state import State
+from ..step.step import Step
 from .capture import NUMBERS, Same, is_of_library, version
-from .grid import Grid
-from .laws.mixture import Mixture
-from .parameters import has_hooks
-from .state import State
-from .step import Step
 
 
 class StepKey:

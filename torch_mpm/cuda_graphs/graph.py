@@ -9,8 +9,8 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from ..state.state import FIELDS, State
 from .capture import capturing
-from .state import FIELDS, State
 
 PIECE, PIECES, LEAST_PARTICLES = 2**25, 4, 2**13
 """Particles times steps of a piece of work, the pieces in flight, and the particles that take no less time than fewer

@@ -11,7 +11,7 @@ from typing import Any
 from unittest import mock
 from urllib.parse import urlsplit
 
-from . import optional
+from .. import optional
 
 MOST_PORT = 65535
 

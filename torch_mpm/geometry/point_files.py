@@ -13,8 +13,8 @@ from typing import IO, Any, NamedTuple
 
 import numpy as np
 
-from . import memory
-from .files import check_file
+from ..data import host_memory
+from ..files import check_file
 from .surface_mesh import Array
 
 FAMILIES = ("", "points?", "positions?", "coordinates?", "coords?", "pos")
@@ -103,7 +103,7 @@ def _array(handle: IO[bytes], size: int) -> Array:
     count = math.prod(shape)
     if dtype.kind not in "fiu":
         raise ValueError(f"it must hold numbers, got an array of {dtype}")
-    if count * dtype.itemsize > min(size, memory.available() / 4):
+    if count * dtype.itemsize > min(size, host_memory.available() / 4):
         raise ValueError(f"its array {list(shape)} is larger than its {size} bytes, or than the free memory")
     values = np.frombuffer(handle.read(count * dtype.itemsize), dtype, count).astype(np.float64)
     return values.reshape(shape, order="F" if fortran else "C").copy()

@@ -8,10 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .activation_record import ActivationRecord
-from .capture import is_traced
-from .ops.arguments import per_particle, split_dt
-from .state import PARTICLE_FIELDS, State
+from ..cuda_graphs.capture import is_traced
+from ..ops.arguments import per_particle, split_dt
+from ..state.state import PARTICLE_FIELDS, State
+from .status import ActivationRecord
 
 
 def paused(

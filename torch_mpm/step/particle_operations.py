@@ -19,12 +19,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from .capture import GraphCache
-from .errors import check_number, check_vector, shape_of
-from .ops.arguments import per_particle
-from .parameters import TensorModule
-from .state import State
-from .step_times import time_like
+from ..cuda_graphs.capture import GraphCache
+from ..errors import check_number, check_vector, shape_of
+from ..laws.parameters import TensorModule
+from ..ops.arguments import per_particle
+from ..state.state import State
+from .clocks import time_like
 
 ParticleOperation = Callable[[State, "float | Tensor"], "State | tuple[State, Tensor]"]
 Time = float | Tensor

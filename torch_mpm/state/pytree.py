@@ -10,11 +10,11 @@ from torch import Tensor
 from torch.utils import _pytree
 from torch.utils.data._utils.collate import default_collate_fn_map
 
-from .capture import is_traced
+from ..cuda_graphs.capture import is_traced
 from .state import FIELDS, State
 
 if TYPE_CHECKING:
-    from .boundaries.control import Poses
+    from ..boundaries.control import Poses
 
 TENSORS = sorted((name for name in FIELDS if name not in ("extra", "time")), reverse=True)
 """Sort key: a name comes before its prefixes, which `torch.export` needs to distinguish `v` from `volume`."""

@@ -22,12 +22,12 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from .errors import shape_of
-from .ops.impulses import impulse_size, with_moment
+from ..errors import shape_of
+from ..ops.impulses import impulse_size, with_moment
 
 if TYPE_CHECKING:
-    from .state import State
-    from .step import Step
+    from ..state.state import State
+    from ..step.step import Step
 
 FACES = ("-x", "+x", "-y", "+y", "-z", "+z")
 """Names of the faces of the domain, in their order."""

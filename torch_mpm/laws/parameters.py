@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from .capture import GraphCache, is_traced
-from .errors import check_numbers, check_real, shape_of
-from .ops.arguments import per_parameter
+from ..cuda_graphs.capture import GraphCache, is_traced
+from ..errors import check_numbers, check_real, shape_of
+from ..ops.arguments import per_parameter
 
 if TYPE_CHECKING:
-    from .state import State
+    from ..state.state import State
 
 Value = float | Tensor | Callable[[Tensor], Tensor]
 """Parameter: a number; a tensor [], [1], [B] or [P]; a function of the temperature [P] [K] that returns [P], or a

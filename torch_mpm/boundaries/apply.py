@@ -9,14 +9,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .boundaries import Obstacle, call_boundary
-from .grid import Blocks
-from .ops import contact, contact_impulses, fusible
-from .ops.contact import MAX_OBSTACLES
-from .ops.impulses import impulse_of_nodes
-from .precision import from_half, full_precision
-from .state import State
-from .step_times import time_like
+from ..grid.grid import Blocks
+from ..ops import contact, contact_impulses, fusible
+from ..ops.contact import MAX_OBSTACLES
+from ..ops.impulses import impulse_of_nodes
+from ..precision import from_half, full_precision
+from ..state.state import State
+from ..step.clocks import time_like
+from . import Obstacle, call_boundary
 
 
 def after_boundaries(

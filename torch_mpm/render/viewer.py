@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from .data.clips import Source
-from .data.trajectory import Array
-from .render.cloud import rest_spacing
-from .render.colors import PALETTES, QUANTITIES, Quantity, map_colors, palette_colors, value_range
-from .view_server import viser_server
+from ..data.clips import Source
+from ..data.trajectory import Array
+from .cloud import rest_spacing
+from .colors import PALETTES, QUANTITIES, Quantity, map_colors, palette_colors, value_range
+from .viewer_server import viser_server
 
 PLAYED_FPS = 30
 COUNTED = ("particle_type", *PALETTES)

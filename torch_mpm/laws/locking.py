@@ -14,9 +14,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from .capture import without_transforms
-from .errors import LockingWarning
-from .laws.compiled import SolidLaw
+from ..cuda_graphs.capture import without_transforms
+from ..errors import LockingWarning
+from .compiled import SolidLaw
 from .parameters import PerMaterial
 
 LARGEST = {"quadratic": 50.0, "cubic": 500.0}

@@ -9,9 +9,9 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from .capture import GraphCache
-from .errors import check_number, shape_of
-from .parameters import TensorModule
+from ..cuda_graphs.capture import GraphCache
+from ..errors import check_number, shape_of
+from ..laws.parameters import TensorModule
 
 Value = float | Sequence[float] | Tensor
 

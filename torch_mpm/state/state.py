@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from .capture import is_captured, is_traced, version
-from .errors import (
+from ..cuda_graphs.capture import is_captured, is_traced, version
+from ..errors import (
     FLOATING,
     NUMBER_OR_TENSOR,
     check_count,
@@ -26,13 +26,13 @@ from .errors import (
     default_dtype,
     shape_of,
 )
-from .grid import Grid, check_grid
-from .ops.arguments import refuse_batched, scenes_up_to, soa_empty
-from .ops.autograd import dispatch, is_recorded
-from .seed import Points
+from ..geometry.seed import Points
+from ..grid.grid import Grid, check_grid
+from ..ops.arguments import refuse_batched, scenes_up_to, soa_empty
+from ..ops.autograd import dispatch, is_recorded
 
 if TYPE_CHECKING:
-    from .boundaries.control import Poses
+    from ..boundaries.control import Poses
 
 
 class Time:

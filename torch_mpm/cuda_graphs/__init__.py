@@ -1,0 +1,1 @@
+"""What recordings of CUDA graphs share."""

@@ -1,0 +1,1 @@
+"""Shapes, points within them, and per-scene arrays of coordinates."""
