@@ -603,4 +603,4 @@ def test_obstacles(device, recorded):
     assert not recorded
     if device == "cuda":
         assert "not graph: there are hooks" in step.explain(state, DT)
-        assert "rollout(graph=...) takes some" in learned(device)[0].explain(state, DT)
+        assert "rollout(graph=...) launches some" in learned(device)[0].explain(state, DT)

@@ -5,9 +5,8 @@
 #include <cstdint>
 #include <string>
 
-// Which way a call of many substeps goes: the facts of the call, the schedules with what each supports and when it
-// pays, and the choice. The only place of these thresholds. Host code without tensors, so that a build without CUDA
-// plans for CUDA too.
+// The choice of the schedule of a call of many substeps: facts of the call, a table of schedules with conditions of
+// support and of profit, and all thresholds. Host code without tensors, so a build without CUDA plans for CUDA too.
 namespace mpm {
 
 // INT(name) and BOOL(name) in the order of the op `plan_substeps`.
@@ -82,22 +81,22 @@ constexpr int64_t kFewBlocks = 1 << 12;
 template <int D>
 constexpr int kFewItems = D == 2 ? 250 : 140;
 
-// The pool of a call on CUDA that follows the scene: nobody looks meanwhile whether it must grow.
+// Steps of a call on CUDA whose pool follows the scene. The pool cannot grow within a call.
 constexpr int64_t kGrowingSteps = 64;
-// So many particles take as much memory as the nodes of a block do. A pool that they leave room for is looked at less
-// often: one with kRoomy times the blocks of one that follows the scene after kRoomySteps, twice that with twice as
-// many, and one that has room for all blocks of the domain after kWholeSteps.
+// kParticlesPerBlock particles need as much memory as the nodes of a block. A larger pool allows longer calls:
+// kRoomySteps with kRoomy times the blocks of a pool that follows the scene, twice as many steps with twice that size,
+// and kWholeSteps with all blocks of the domain.
 constexpr int64_t kParticlesPerBlock = 32, kRoomy = 3, kRoomySteps = 256, kWholeSteps = 1024;
-// Particles times steps of a call on CUDA that may be one kernel, which nothing interrupts: about a quarter of a second
-// on an H100. A call of fewer steps would cost more, and fewer particles take no less time.
+// Particles times steps of a call on CUDA that may be one kernel, which cannot be interrupted: about a quarter of a
+// second on an H100. Shorter calls cost more per step, and fewer particles take no less time.
 constexpr int64_t kWorkOfCall = 1 << 28, kLeastStepsOfCall = 512, kLeastParticlesOfCall = 1 << 13;
 constexpr int64_t kMostPathBytes = 1 << 26;  // of a call, for obstacles on paths
 
-// For which a sort of particles in no order and the way back, together some four steps, are worth it: of such particles
-// a step takes up to five times as long on a GPU.
+// Smallest call for which sorting unsorted particles, and restoring their order, pays: both cost about four steps, and
+// a step of unsorted particles takes up to five times as long on a GPU.
 constexpr int64_t kLeastSortedSteps = 64, kLeastSortedParticles = 1 << 15;
 
-// Whether a block per scene is faster than kernels of whole grids, by what both took on an H200 [µs].
+// Whether a block per scene is faster than kernels of whole grids, by times measured on an H200 [µs].
 template <int D>
 bool resident_pays(int64_t particles, int64_t scenes) {
   if (scenes == 1) return particles <= 96;  // else a kernel with many thread blocks is (rollout/schedules/persistent.h)
@@ -107,7 +106,7 @@ bool resident_pays(int64_t particles, int64_t scenes) {
   return resident < together;
 }
 
-// About how many items the particles of a step make if the pool has `blocks` (rollout/schedules/persistent.h).
+// Estimated number of items of a step with a pool of `blocks` (rollout/schedules/persistent.h).
 inline double items_of_step(const PlanFacts& f, int64_t blocks) {
   const double active = double(blocks) / 1.5;                                // of a pool that has grown
   if (f.dim == 2) return std::max(0.8 * active, double(f.particles) / 150);  // most have particles, seldom two items
@@ -125,7 +124,7 @@ enum Schedule : int64_t {
   kSortedCpu       // particles lie in the order of their cells; G2P and the next P2G in one pass (CPU)
 };
 
-// Each function gives the reason why not, or nothing.
+// Each function returns the reason against the schedule, or an empty text.
 struct ScheduleEntry {
   Schedule schedule;
   const char* name;
@@ -133,13 +132,13 @@ struct ScheduleEntry {
   std::string (*unprofitable)(const PlanFacts&);  // of a call that is supported
 };
 
-// Whether sums of nodes do not depend on the order of their terms, in deterministic mode on CUDA. Of a call without
-// gradients: the backward pass takes its steps again one by one.
+// Whether sums of nodes are independent of the order of their terms, in deterministic mode on CUDA. Only without
+// gradients: the backward pass recomputes its steps one by one.
 inline bool sums_are_fixed(const PlanFacts& f) {
   return f.cuda && f.float32 && f.deterministic && !f.gradients && !f.impulses && !f.clocks && !f.mirrors;
 }
 
-// Why no kernel can take a law and P2G together.
+// Reason why no kernel combines the law and P2G.
 inline std::string why_not_fused_law(const PlanFacts& f) {
   if (!f.cuda) return "the particles are on the CPU";
   if (!f.float32) return "the particles are in float64";
@@ -150,17 +149,17 @@ inline std::string why_not_fused_law(const PlanFacts& f) {
   return {};
 }
 
-// Why a call is not of the form that kernels of many phases are for.
+// Reason why kernels of several phases do not support a call.
 inline std::string why_not_many_phases(const PlanFacts& f) {
   if (std::string reason = why_not_fused_law(f); !reason.empty()) return reason;
   if (f.flips) return "FLIP needs the velocities before the forces";
   if (!f.apic) return "the transfer is not APIC";
   if (f.mirrors) return "mirrors read nodes of other blocks";
-  if (f.impulses) return "impulses are summed up";
+  if (f.impulses) return "impulses are accumulated";
   return {};
 }
 
-// Why P2G cannot move F or J for the G2P before it.
+// Reason why P2G cannot update F or J in place of the previous G2P.
 inline std::string why_not_late(const PlanFacts& f) {
   if (std::string reason = why_not_many_phases(f); !reason.empty()) return reason;
   if (f.gradients) return "gradients are wanted";
@@ -178,7 +177,7 @@ inline std::string unsupported(const PlanFacts& f) {
   if (std::string reason = why_not_fused_law(f); !reason.empty()) return reason;
   if (f.flips) return "FLIP needs the velocities before the forces";
   if (f.mirrors) return "mirrors read nodes of other blocks";
-  if (f.impulses) return "impulses are summed up";
+  if (f.impulses) return "impulses are accumulated";
   if (f.gradients) return "gradients are wanted";
   if (f.particles == 0) return "there are no particles";
   if (f.steps < kLeastResidentSteps) return "a call has fewer than " + count(kLeastResidentSteps, "steps");
@@ -241,7 +240,7 @@ inline std::string unsupported(const PlanFacts& f) {
 inline std::string unprofitable(const PlanFacts& f) { return f.steps < 2 ? "there is no step after the first" : ""; }
 }  // namespace sorted_cpu
 
-// In the order in which they are tried, but for the first, which serves every call.
+// The first supports every call.
 constexpr ScheduleEntry kSchedules[] = {
     {kPerStep, "per_step", nothing, nothing},
     {kFusedG2P2G, "fused_g2p2g", fused_g2p2g::unsupported, fused_g2p2g::unprofitable},
@@ -251,7 +250,7 @@ constexpr ScheduleEntry kSchedules[] = {
 };
 constexpr Schedule kOrderOfChoice[] = {kBlockPerScene, kFusedG2P2G, kPersistent, kSortedCpu};
 
-// The schedule of a call with the pool of `facts`.
+// The first profitable schedule for a call with the pool of `facts`.
 inline Schedule choose_schedule(const PlanFacts& facts) {
   for (const Schedule s : kOrderOfChoice)
     if (kSchedules[s].unsupported(facts).empty() && kSchedules[s].unprofitable(facts).empty()) return s;
@@ -265,7 +264,7 @@ struct PlannedPool {
   int64_t steps;   // of a call at most
 };
 
-// Whether the persistent kernel takes the steps if the pool has room for all blocks.
+// Whether the persistent schedule pays if the pool has all blocks of the domain.
 inline bool takes_few_blocks(const PlanFacts& f) {
   if (f.blocks() > kFewBlocks || !why_not_many_phases(f).empty() || f.steps < kLeastPersistentSteps) return false;
   if (f.particles > kMostPersistentParticles) return false;
@@ -273,10 +272,10 @@ inline bool takes_few_blocks(const PlanFacts& f) {
   return items_of_step(f, f.max_blocks) <= (f.dim == 2 ? kFewItems<2> : kFewItems<3>);
 }
 
-// The pool of a call, and its steps. Nobody looks whether a pool must grow that has room for all blocks of the domain:
-// where there are few, and a kernel takes many steps of few particles, or where many particles take more memory. A pool
-// that they leave room for is looked at less often, if steps do not pass over all of it. Of deterministic grids nothing
-// depends on how many blocks they have had, or a second run would not be the first one bit by bit.
+// The pool and the steps of a call. A pool with all blocks of the domain never has to grow: for few blocks with the
+// persistent schedule, or where the particles need more memory. A larger pool is looked at less often, unless kernels
+// pass over all of its blocks. On deterministic grids the choice is independent of the number of blocks so far, since a
+// second run must equal the first bit by bit.
 inline PlannedPool pool_for(const PlanFacts& f) {
   if (!f.cuda) return {-1, kMostSteps};
   if (!f.grows) {
@@ -292,7 +291,7 @@ inline PlannedPool pool_for(const PlanFacts& f) {
   return {-1, kGrowingSteps};
 }
 
-// What is done about particles that nobody has sorted, where it is worth it.
+// Order of unsorted particles.
 enum Order : int64_t {
   kAsGiven,
   kSortedBefore,  // sorted before the call, and put back after it

@@ -16,8 +16,8 @@ constexpr char kSchema[] = "plan_substeps(int schedule" MPM_PLAN_FACTS(
 #undef MPM_INT
 #undef MPM_BOOL
 
-// Steps of a call at most: of a schedule that is forced as many in each call, or nearly so, such that the last one does
-// not have too few.
+// Largest number of steps of a call. Calls of a requested schedule have nearly equal numbers, so that the last one has
+// enough steps for it.
 int64_t steps_of_call(const PlanFacts& f, int64_t most, bool forced) {
   if (f.path_bytes > 0) most = std::min(most, std::max<int64_t>(kMostPathBytes / f.path_bytes, 1));
   if (f.steps <= most || !forced) return std::min(f.steps, most);
@@ -25,13 +25,13 @@ int64_t steps_of_call(const PlanFacts& f, int64_t most, bool forced) {
   return (f.steps + calls - 1) / calls;
 }
 
-// A line "name: reason" for each schedule that is not the one.
+// A line "name: reason" for each other schedule.
 std::string reasons_against(const PlanFacts& f, Schedule chosen, bool forced) {
   std::string text;
   for (const ScheduleEntry& s : kSchedules) {
     if (s.schedule == chosen) continue;
     std::string reason = s.unsupported(f);
-    if (reason.empty() && forced) reason = std::string(kSchedules[chosen].name) + " was asked for";
+    if (reason.empty() && forced) reason = std::string(kSchedules[chosen].name) + " was requested";
     if (reason.empty()) reason = s.unprofitable(f);
     if (reason.empty()) reason = std::string(kSchedules[chosen].name) + " is faster";
     text += std::string(text.empty() ? "" : "\n") + s.name + ": " + reason;

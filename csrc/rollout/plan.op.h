@@ -3,7 +3,7 @@
 #include "common/backend.h"
 #include "rollout/plan.h"
 
-// The schedule that a call asks for, as ops check it.
+// Checks of the schedule argument of ops.
 namespace mpm {
 
 inline void check_schedule(int64_t schedule) {
@@ -14,10 +14,10 @@ inline void check_schedule(int64_t schedule) {
 inline void check_supported(Schedule schedule, const PlanFacts& facts) {
   const ScheduleEntry& s = kSchedules[schedule];
   const std::string reason = s.unsupported(facts);
-  STD_TORCH_CHECK(reason.empty(), "schedule must be one that can take the steps, got ", s.name, ": ", reason);
+  STD_TORCH_CHECK(reason.empty(), "schedule must be one that supports the call, got ", s.name, ": ", reason);
 }
 
-// The one that is asked for, or that is chosen.
+// The requested schedule, or the chosen one.
 inline Schedule schedule_of(int64_t wanted, const PlanFacts& facts) {
   check_schedule(wanted);
   if (wanted == kChoose) return choose_schedule(facts);

@@ -444,7 +444,7 @@ Substeps<T, D>::Substeps(const SubstepsInputs& inputs) : in(inputs) {
   facts = facts_of_call();
 }
 
-// But for those of the stream and the device, which are not looked at where nothing depends on them.
+// Without the facts of the stream and the device.
 template <class T, int D>
 PlanFacts Substeps<T, D>::facts_of_call() const {
   PlanFacts f;

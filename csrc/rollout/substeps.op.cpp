@@ -240,7 +240,7 @@ Results run(const SubstepsInputs& in) {
       }
       if (in.schedule == kChoose) schedule_of_latest = kPerStep;  // of the rest
       s.facts.graph_loops = !loops_are_refused;
-      schedule_of(in.schedule, s.facts);  // which is an error if it was asked for
+      schedule_of(in.schedule, s.facts);  // an error if it was requested
     }
 #endif
     while (step < n) {
@@ -259,7 +259,7 @@ Results run(const SubstepsInputs& in) {
 
 Results substeps(MPM_SUBSTEPS_PARAMETERS) { return run(SubstepsInputs{MPM_SUBSTEPS_ARGUMENTS}); }
 
-// By which the latest call on the device of a tensor went, of this thread.
+// Schedule of the latest call of this thread on the device of a tensor.
 int64_t latest_schedule(const Tensor&) { return schedule_of_latest; }
 
 }  // namespace

@@ -55,7 +55,7 @@ def test_explain_says_which_and_by_how_much():
     step, state = block()
     assert step.explain(state).startswith("all steps in one op")
     slow, fast = step.explain(state, speed=0.01), step.explain(state, speed=5.0)
-    assert slow.startswith("all steps in one op, by schedule sorted_cpu; implicit steps of 0.063 s")
+    assert slow.startswith("all steps in one op (executor fused, schedule sorted_cpu); implicit steps of 0.063 s")
     assert float(re.search(r"about (\S+) times as fast", slow)[1]) > 10
     assert float(re.search(r"about (\S+) times as slow", fast)[1]) > 5
     implicit = mpm.Step(step.grid, step.law, integrator="implicit")

@@ -172,7 +172,7 @@ def test_order_of_particles(changes, order):
     ],
 )
 def test_a_schedule_that_cannot_take_the_steps(schedule, facts, reason):
-    with pytest.raises(RuntimeError, match=f"schedule must be one that can take the steps, got {schedule}: .*{reason}"):
+    with pytest.raises(RuntimeError, match=f"schedule must be one that supports the call, got {schedule}: .*{reason}"):
         plan_call(schedule, facts)
 
 
@@ -180,7 +180,7 @@ def test_a_forced_schedule_pays_or_not():
     few = FEW._replace(particles=500)
     assert plan_call("fused_g2p2g", few).schedule == "fused_g2p2g"
     assert plan_call("per_step", FEW).schedule == "per_step"
-    assert dict(plan_call("per_step", FEW).reasons)["persistent"] == "per_step was asked for"
+    assert dict(plan_call("per_step", FEW).reasons)["persistent"] == "per_step was requested"
 
 
 def test_calls_of_a_forced_schedule_have_about_as_many_steps():
@@ -205,7 +205,7 @@ def test_a_plan_is_a_value(device):
         with pytest.raises(dataclasses.FrozenInstanceError):
             plan.schedule = "per_step"
         text = step.explain(state, DT, n=20)
-        assert text == str(plan) and f"all steps in one op, by schedule {plan.schedule}\n" in text
+        assert text == str(plan) and f"all steps in one op (executor fused, schedule {plan.schedule})\n" in text
         assert all(f"not {name}: {reason}" in text for name, reason in plan.reasons.items())
         end = mpm.rollout(step, state, 20, DT, plan=plan)
         assert torch.equal(end.x, mpm.rollout(step, state, 20, DT).x)
@@ -217,7 +217,7 @@ def test_plans_of_rollouts_with_gradients(device):
     state = state.replace(v=state.v.requires_grad_())
     plan = mpm.plan_rollout(step, state, 20, DT, checkpoint=5)
     assert (plan.steps_per_call, plan.checkpoints) == (5, mpm.Checkpoints(every=5))
-    assert str(plan).startswith("all steps between two kept states in one op, by schedule ")
+    assert str(plan).startswith("all steps between two kept states in one op (executor fused, schedule ")
     whole = mpm.plan_rollout(step, state, 20, DT, checkpoint=mpm.Checkpoints(memory=1e9))
     assert whole.stores_all and whole.schedule == "per_step"
     ends = [mpm.rollout(step, state, 20, DT, plan=p).x for p in (plan, whole)]

@@ -309,7 +309,9 @@ class CompiledLaw(Material):
         for kept in (self._parameters, self._buffers, self._modules):
             for name, value in kept.items():
                 registered[name] = value
-        return registered if torch.compiler.is_compiling() else {**vars(self), **registered}
+        if torch.compiler.is_compiling():
+            return registered
+        return {**{name: value for name, value in vars(self).items() if name not in _OF_MODULES}, **registered}
 
     def _parameters_of(self, state: State) -> list[Tensor]:
         """Parameters in the dtype, on the device and in the particle order of the state.
@@ -319,15 +321,15 @@ class CompiledLaw(Material):
         if self._functions:
             in_order: Any = Overlay(state, ids=None)  # Evaluated parameters have this form already.
             return self._at_temperature(state)._convert(in_order)
-        tensors = [value for value in self._stored().values() if isinstance(value, Tensor)]
+        stored = self._stored().values()
+        tensors = [value for value in stored if isinstance(value, Tensor)]
         x, order = state.x, None
         particles = getattr(state, "particles", x.shape[0])
         if not all(needs_no_scenes(t, particles) for t in tensors):
             self.check_parameters(particles, state.scenes)
         if torch.compiler.is_compiling() or any(t.requires_grad for t in tensors):
             return self._convert(state)
-        own = [value for name, value in vars(self).items() if name not in _OF_MODULES]
-        numbers = [value for value in own if isinstance(value, Real)]
+        numbers = [value for value in stored if not isinstance(value, Tensor) and isinstance(value, (float, int, Real))]
         if any(t.numel() == particles for t in tensors):
             order = state.ids  # Only parameters that differ by particle.
         key = (x.dtype, x.device, order, *numbers, *tensors)

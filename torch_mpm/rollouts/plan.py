@@ -1,4 +1,4 @@
-"""Which way a rollout goes: decided once, before it starts, as a value."""
+"""Plans of rollouts: executor and schedule, chosen once before the first step, as a value."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ _WORDS = {
 
 
 class Facts(NamedTuple):
-    """What the choice of a schedule depends on: the arguments of `torch.ops.torch_mpm.plan_substeps` after the first,
-    which are explained in csrc/rollout/plan.h."""
+    """Facts that determine the schedule: the arguments of `torch.ops.torch_mpm.plan_substeps` after the first,
+    explained in csrc/rollout/plan.h."""
 
     cuda: bool
     float32: bool
@@ -102,7 +102,7 @@ def plan_call(schedule: str | None, facts: Facts) -> CallPlan:
     """The plan of the next call of the fused op.
 
     Raises:
-        RuntimeError: for a schedule that cannot take the steps.
+        RuntimeError: for a schedule that does not support the call.
     """
     number = -1 if schedule is None else SCHEDULES.index(schedule)
     chosen, blocks, steps, order, reasons = torch.ops.torch_mpm.plan_substeps(number, *facts)
@@ -112,7 +112,7 @@ def plan_call(schedule: str | None, facts: Facts) -> CallPlan:
 
 @dataclasses.dataclass(frozen=True)
 class RolloutPlan:
-    """Which way a rollout goes, and why not another one; `str` gives it in words.
+    """Executor and schedule of a rollout, and the reasons against the others; `str` returns both in words.
 
     Attributes:
         executor: "fused" for calls of one op; "replay" for replays of a CUDA graph of one step; "graph" for CUDA graphs
@@ -125,7 +125,7 @@ class RolloutPlan:
             `Checkpoints(memory=...)` has become the number of states that fits.
         reasons: why each other executor and schedule was not chosen, by name.
         forced: whether the schedule was given. Otherwise each call chooses in the same way.
-        facts: what the schedule of the first call depends on; None for other executors.
+        facts: facts of the first call; None for other executors.
     """
 
     executor: Executor
@@ -162,10 +162,10 @@ class RolloutPlan:
         if self.executor == "fused":
             assert self.facts is not None
             words = "all steps between two kept states in one op" if self.facts.gradients else words
-            return f"{words}, by schedule {self.schedule}"
+            return f"{words} (executor fused, schedule {self.schedule})"
         if self.executor == "graph":
             words += f" of {self.steps_per_call} steps"
-        return f"{words}, because {self.reasons['fused']}"
+        return f"{words}, because {self.reasons['fused']} (executor {self.executor})"
 
     def __str__(self) -> str:
         others = [f"not {name}: {reason}" for name, reason in self.reasons.items()]
@@ -182,10 +182,10 @@ def plan_rollout(
     graph: int | None = None,
     schedule: str | None = None,
 ) -> RolloutPlan:
-    """Which way `rollout` with these arguments goes, and why not another one.
+    """Plan of `rollout` with these arguments.
 
-    No step is taken, but for one aside where a budget of memory is to be shared out over steps from Python. Nothing is
-    changed, and the device is not waited for.
+    Nothing is computed or changed, and the host does not wait for the device. Exception: with a budget of memory for
+    steps from Python, one step is computed and dropped to measure its memory.
 
     Args:
         step, state, n, dt, checkpoint, graph: as `rollout`.
@@ -193,7 +193,8 @@ def plan_rollout(
             "sorted_cpu" (docs/architecture.md). None: the fastest one.
 
     Raises:
-        TypeError, ValueError: for a wrong argument, and for a schedule that cannot take the steps, with the reason.
+        TypeError, ValueError: for a wrong argument, and for a schedule that does not support the steps, with the
+            reason.
     """
     if not callable(step):
         raise TypeError(f"step must be a Step or a function (state, dt) -> state, got {shape_of(step)}")
@@ -234,7 +235,7 @@ def plan_of_steps(
     if no_graph is None and graph is not None:
         reasons["loop"] = "graphs are faster"
         return RolloutPlan("graph", None, max(min(graph, n), 1), None, False, checkpoints, reasons)
-    reasons["graph"] = no_graph or "rollout(graph=...) takes some steps from a graph"
+    reasons["graph"] = no_graph or "rollout(graph=...) launches some steps as a graph"
     return RolloutPlan("loop", None, 1, None, False, checkpoints, reasons)
 
 
@@ -249,7 +250,7 @@ def _that_fit(
     return resolved(checkpoints, step, state, n, dt, fused) or EVERYTHING
 
 
-_INSTEAD = {name: "the op takes all steps" for name in ("replay", "graph", "loop")}
+_INSTEAD = {name: "the op computes all steps" for name in ("replay", "graph", "loop")}
 
 
 def _fused(
@@ -275,7 +276,7 @@ def _fused(
 
 
 def why_not_fused(step: Any, state: State, dt: float | Tensor) -> str | None:
-    """Why the fused op cannot take the steps from a state; None where it can."""
+    """Reason why the fused op does not support the steps; None if it does."""
     if type(step) is not Step:
         return f"{type(step).__name__} may do more than a Step" if isinstance(step, Step) else "it is no Step"
     x, law = state.x, step.law
@@ -316,14 +317,14 @@ _FORWARD = CompiledLaw.forward
 
 
 def _why_not_eager(x: Tensor) -> str | None:
-    """Why steps from a position must be those of Python, which others look at."""
+    """Reason why steps must be launched from Python one by one, where other code observes them."""
     if torch.compiler.is_compiling() or is_traced(x) or is_captured(x) or is_transformed():
         return "it is compiled, captured or transformed"
     return "anomaly detection looks at every step" if detecting() else None
 
 
 def _why_no_graph(step: nn.Module, state: State, dt: float | Tensor) -> str | None:
-    """Why no CUDA graph can have the steps."""
+    """Reason why the steps cannot be captured in CUDA graphs."""
     if isinstance(dt, Tensor):
         return "dt is a tensor"
     if (reason := _why_not_eager(state.x)) is not None:
@@ -339,8 +340,8 @@ def _why_no_graph(step: nn.Module, state: State, dt: float | Tensor) -> str | No
 
 
 def _why_not_replay(step: Any, state: State, n: int, dt: float | Tensor) -> str | None:
-    """Why `replayed` cannot take the steps from a state; None where it can. What the library does not know stays in
-    Python: a function may count its calls, or look at the time."""
+    """Reason why `replayed` does not support the steps; None if it does. Unknown functions are called from Python: a
+    function may count its calls, or read the time."""
     if type(step) is not Step:
         return "it is not a plain Step"
     if not state.x.is_cuda:
@@ -357,7 +358,7 @@ def _why_not_replay(step: Any, state: State, n: int, dt: float | Tensor) -> str 
 
 
 def _why_not_graphs(step: Any, state: State, dt: float | Tensor) -> str | None:
-    """Why `in_graphs` cannot take the steps from a state; None where it can."""
+    """Reason why `in_graphs` does not support the steps; None if it does."""
     if not isinstance(step, nn.Module):
         return "it is no module"
     if not graph_segments.has_graphs(state.x.device):
@@ -405,7 +406,7 @@ def _all_of(step: Step) -> list[Tensor]:
 
 
 def facts_of(step: Step, state: State, n: int, dt: float | Tensor, stores_all: bool = False) -> Facts:
-    """Those of n steps, in one op if possible."""
+    """Facts of n steps in the fused op."""
     x, grid = state.x, step.grid
     law = step.law
     laws, moved = laws_of(law), law.state_fields

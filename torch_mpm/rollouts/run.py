@@ -81,8 +81,8 @@ def rollout(
     `torch.autograd.detect_anomaly` a gradient that is NaN is reported with its operation, substep and scene.
 
     Raises:
-        TypeError, ValueError: for a number of steps that is no whole number or out of range, a schedule that cannot
-            take the steps, a plan that is not for them, or what `step` raises.
+        TypeError, ValueError: for a number of steps that is no whole number or out of range, a schedule that does
+            not support the steps, a plan that is not for them, or what `step` raises.
     """
     if not callable(step):
         raise TypeError(f"step must be a Step or a function (state, dt) -> state, got {shape_of(step)}")

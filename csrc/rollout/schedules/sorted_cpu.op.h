@@ -67,7 +67,7 @@ class OwnParticles {
  public:
   OwnField<T> x, v, C, F, J, residual, history;
 
-  // Of steps that may change the order of the particles, or must not.
+  // `sorts`: whether steps may change the order of the particles.
   OwnParticles(Substeps<T, D>& steps, const Tensor& packed_history, bool sorts, backend::Stream stream);
 
   // Whether an activation may serve several substeps of a call. Where it does, G2P and the next P2G are one pass. Not
