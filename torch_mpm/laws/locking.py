@@ -95,4 +95,4 @@ def _values(value: Any, devices: bool) -> Iterator[Tensor]:
         if not value.is_meta and (devices or value.device.type == "cpu"):
             yield without_transforms(value.detach()).cpu().double()
     elif not callable(value):
-        yield torch.tensor(float(value), dtype=torch.float64)
+        yield torch.tensor(float(value), dtype=torch.float64, device="cpu")
