@@ -57,7 +57,7 @@ MOVED = {
 
 
 class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
-    """Makes modules under the old names, whose attributes are those of the new ones."""
+    """Imports the modules of the new paths under the old ones."""
 
     def find_spec(self, name: str, path: Any = None, target: Any = None) -> importlib.machinery.ModuleSpec | None:
         package, _, old = name.rpartition(".")
@@ -70,8 +70,7 @@ class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         new = f"{PACKAGE}.{MOVED[module.__name__.rpartition('.')[2]]}"
         warnings.warn(f"{module.__name__} has moved to {new}", DeprecationWarning, stacklevel=2)
         target = importlib.import_module(new)
-        module.__doc__ = target.__doc__
-        vars(module)["__getattr__"] = lambda name: getattr(target, name)
+        sys.modules[module.__name__] = target  # What the import returns.
 
 
 def attributes_of(package: str, module: str) -> Callable[[str], Any]:

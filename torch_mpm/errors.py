@@ -69,6 +69,13 @@ REAL = (float, int, torch.SymFloat, torch.SymInt, numbers.Real)
 NUMBER_OR_TENSOR = "a number or a tensor"
 
 
+def is_finite(value: object) -> bool:
+    """Whether a value is a number that a float can hold, and neither infinite nor NaN."""
+    if isinstance(value, int):  # math.isfinite raises OverflowError for those that no float can hold.
+        return abs(value) <= LARGEST[torch.float64]
+    return isinstance(value, float) and math.isfinite(value)
+
+
 def check_real(name: str, value: Any, kinds: str = "a number") -> float:
     """A number that a float can hold, including infinity and NaN; `kinds` describes other accepted types."""
     if not isinstance(value, REAL):

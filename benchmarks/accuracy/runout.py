@@ -419,11 +419,13 @@ def standing(case: Case, angles: Sequence[float], duration: float, device: str) 
     reach = 1.3 * height / math.tan(math.radians(min(angles)))
     state, _, steps = simulate(case, states, [height] * len(angles), reach, duration, device)
     moved = (state.restored().x.double().cpu() - starts).norm(dim=1).split([len(s) for s in states])
-    failed = [float(d.mean()) > 0.02 * height for d in moved]
+    displacement = [float(d.mean()) / height for d in moved]
+    failed = [d > 0.02 for d in displacement]
     print(f"standing slopes, {case.name}: {steps} steps in {time.perf_counter() - begin:.1f} s", flush=True)
     return {
         "case": dataclasses.asdict(case),
         "name": case.name,
+        "displacement": displacement,
         "steepest": max((angle for angle, f in zip(angles, failed, strict=True) if not f), default=math.nan),
         "least failing": min((angle for angle, f in zip(angles, failed, strict=True) if f), default=math.nan),
     }

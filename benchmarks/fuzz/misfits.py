@@ -76,6 +76,9 @@ FITTING: tuple[tuple[str, str, str, str], ...] = (
         ".*NaN",
         "numbers that no memory depends on; the functions that call the ops have checked them",
     ),
+    ("law_.*", "parameters", r"[[]\d[]] one dimension more", "a tensor [1]"),
+    ("ops[.]plan_substeps", ".*", "= .*|complex", "torch makes a bool of it; numbers that no memory depends on"),
+    ("ops[.]latest_schedule", "like", ".*", "a tensor of any shape has a device"),
     ("ops[.]law_.*", "parameters", ".*(axis 0|one dimension more)", "uniform, or of more scenes than have particles"),
     (
         "ops[.]quartic.*",
@@ -102,6 +105,7 @@ FITTING: tuple[tuple[str, str, str, str], ...] = (
     ("Surface", "points", "axis 1", "a surface in 3-D"),
     ("contact", "velocity", "on meta", "a fake call"),
     ("substeps_arguments", "blocks", "None", "optional"),
+    ("plan_rollout", "schedule|checkpoint", "None", "optional"),
     ("Step.failures", "state", "None", "optional"),
     ("Waypoints", "position", "a list", "as many lists of numbers"),
     (".* of a batch", "rotation|radius|friction|angular_velocity", "a list", "a number per scene"),

@@ -226,12 +226,15 @@ class _Calls:
         end = (*self.obstacles, 0.1, 2, 40, True, False, False, impulse, *clocks, *self.lattice.packed)
         look = (*fields[:5], self.F, *self.uniform(4, P), self.scene, 50.0, 2.0, True, 0.1, self.lattice.upper, 2)
         call = (*fields, 0.5 + self.uniform(P), None, [self.uniform(P)], *who, *laws, *how, *end)
+        facts = (False, True, D, PARTICLES, 2, 5, 27, 27, True, *[False] * 10, 1, *[False] * 8, 0)
         figures = (self.x, *call[4:7], call[8], self.scene, material, *laws, how[0], how[1], True)
         grads = [self.normal(*t.shape) for t in torch.ops.torch_mpm.substeps(*call)[:6]]
         return [
             ("substeps", call),
             ("substeps_backward", (*grads, torch.ones_like(impulse), 15, None, *call)),
             ("law_figures", figures),
+            ("plan_substeps", (-1, *facts)),
+            ("latest_schedule", (self.x,)),
             ("survey", (*look, *self.obstacles, self.uniform(2).double(), 0.1, *self.lattice.packed)),
         ]
 

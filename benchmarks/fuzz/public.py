@@ -113,6 +113,7 @@ def _rollouts() -> dict[str, Callable[[], Call]]:
         "rollout_to": taken(mpm.rollout_to, time=2e-4, cfl=0.5, longest=1e-3, every=2, most=8, checkpoint=2),
         "frames": taken(mpm.frames, n=2, dt=1e-4, every=1, fields=("x", "F"), prefix=1, truncate=1),
         "estimate_rollout": taken(mpm.estimate_rollout, n=2, dt=1e-4, checkpoint=1, prefix=0, truncate=1),
+        "plan_rollout": taken(mpm.plan_rollout, n=2, dt=1e-4, checkpoint=1, schedule="per_step"),
         "substeps_arguments": taken(mpm.substeps_arguments, n=2, dt=1e-4, records=True, blocks=27),
         "Environments": environments,
         "Environments.advance": advanced,

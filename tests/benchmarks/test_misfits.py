@@ -14,7 +14,8 @@ from benchmarks.fuzz import calls, misfits, public
 
 RESULTS = (
     "Arrival", "Blocks", "DamagedFileError", "Failures", "Frames", "GridOverflowError", "HeatSolve", "Material",
-    "FrontWarning", "PrecisionWarning", "RolloutEstimate", "SimulationError", "Trajectory",
+    "FrontWarning", "LockingWarning", "PrecisionWarning", "RolloutEstimate", "RolloutPlan", "SimulationError",
+    "Trajectory",
 )  # fmt: skip
 """Classes that functions return or raise, and a base class."""
 CUDA_ALONE = ("captured",)

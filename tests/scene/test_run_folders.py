@@ -245,6 +245,7 @@ def test_a_forged_trajectory_is_refused(scene, unfinished, capsys, change, messa
         ({"summary": []}, "has summary = []"),
         ({"summary": {}}, "has a summary that is none"),
         ({"summary": {"frames": "x"}}, "has a summary that is none"),
+        ({"summary": {"seconds": {"total": 10**400}}}, "has a summary that is none"),
     ],
 )
 @pytest.mark.parametrize("name", ["render", "run"])

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import DamagedFileError
+from ..errors import DamagedFileError, is_finite
 from ..files import check_file
 from .hdf5 import READ_ERRORS, h5py_module, storage_problem, unreadable
 from .packing import array_digest
@@ -314,7 +314,7 @@ def _is_positions(data: Any) -> bool:
 def _words_problem(words: dict[str, Any], dim: int) -> str:
     """Problem of the scene file of a scene; "" for none."""
     gravity = words.get("gravity") or [0.0] * dim
-    numbers = isinstance(gravity, list) and all(isinstance(v, (int, float)) and math.isfinite(v) for v in gravity)
+    numbers = isinstance(gravity, list) and all(is_finite(v) for v in gravity)
     if not numbers or (dim and len(gravity) != dim):
         return f"has a scene file whose gravity is {gravity!r:.100}"
     for key, kind in (("material", dict), ("body", list), ("obstacle", list)):

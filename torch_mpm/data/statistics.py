@@ -15,6 +15,8 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from ..errors import is_finite
+
 Array = npt.NDArray[Any]
 
 BOUNDARY = 3
@@ -69,7 +71,7 @@ class Motion:
     @property
     def finite(self) -> bool:
         """Whether all positions were finite."""
-        return all(math.isfinite(v) for s in (self.velocity, self.acceleration) for v in (*s.sum, *s.squares))
+        return all(is_finite(v) for s in (self.velocity, self.acceleration) for v in (*s.sum, *s.squares))
 
 
 class MotionSums:

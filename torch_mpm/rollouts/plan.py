@@ -23,7 +23,7 @@ from ..laws.active import Active
 from ..laws.calls import laws_of, passive
 from ..laws.custom import CustomLaw
 from ..laws.parameters import has_hooks
-from ..ops.arguments import check_choice
+from ..ops.arguments import check_choice, split_dt
 from ..ops.contact import MAX_OBSTACLES, fusible
 from ..ops.obstacle_tables import numbers_of_a_step, path_requires_grad
 from ..state.state import State, check_state
@@ -203,6 +203,8 @@ def plan_rollout(
         check_count("graph", graph, 1)
     kept = as_checkpoints(checkpoint)
     check_state(state)
+    if isinstance(step, Step):
+        split_dt(dt, step.grid.scenes, state.x)
     return plan_of_steps(step, state, n, dt, kept, graph, schedule)
 
 

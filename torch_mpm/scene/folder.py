@@ -6,7 +6,6 @@ import contextlib
 import errno
 import fcntl
 import json
-import math
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,7 +15,7 @@ from ..data.hdf5 import h5py_module
 from ..data.host_memory import in_words
 from ..data.trajectory import COMPLETE, PARTIAL, Layout, Trajectory, create
 from ..data.whole_files import check_inside, check_record, write_record
-from ..errors import DamagedFileError
+from ..errors import DamagedFileError, is_finite
 from ..files import check_file
 from .scene import Scene
 
@@ -170,7 +169,7 @@ def _is_summary(words: dict[str, Any]) -> bool:
     numbers = list(seconds.values())
     if words.keys() != {"seconds"}:
         numbers += [words.get(name) for name in SUMMARY_NUMBERS] + [energy.get(name) for name in ("first", "last")]
-    return all(isinstance(n, (int, float)) and math.isfinite(n) for n in numbers)
+    return all(is_finite(n) for n in numbers)
 
 
 def record_summary(folder: Path, summary: dict[str, Any]) -> None:

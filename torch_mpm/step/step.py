@@ -15,7 +15,7 @@ from ..boundaries.apply import after_boundaries
 from ..boundaries.control import control_step, motions_now
 from ..boundaries.impulses import Impulses, check_impulse, impulses_of, no_impulse
 from ..cuda_graphs.capture import GraphCache, is_captured, is_traced, is_transformed
-from ..errors import REAL, PrecisionWarning, check_flag, check_number, check_vector, shape_of
+from ..errors import REAL, PrecisionWarning, check_flag, check_number, check_vector, is_finite, shape_of
 from ..grid import resolution
 from ..grid.grid import Blocks, Grid, check_grid
 from ..heat.heat import Heat
@@ -275,8 +275,8 @@ class Step(TensorModule):
 
     def _loses_motion(self, state: State, dt: float | Tensor) -> bool:
         number = self._least_dt(dt) if isinstance(dt, Tensor) else dt
-        if not isinstance(number, REAL):
-            return False  # which the step refuses
+        if not isinstance(number, REAL) or (isinstance(number, int) and not is_finite(number)):
+            return False  # The step refuses it.
         return resolution.loses_motion(self.grid, state.x.dtype, number)
 
     def _least_dt(self, dt: Tensor) -> float:
@@ -284,7 +284,7 @@ class Step(TensorModule):
         cuda = dt.device.type == "cuda"
         if cuda and self._read_dt is not None:
             return self._read_dt
-        if is_traced(dt) or is_captured(dt) or is_transformed():
+        if dt.is_meta or is_traced(dt) or is_captured(dt) or is_transformed():
             return math.inf
         values = dt.detach()
         least = float(torch.where(values > 0, values, math.inf).amin()) if values.numel() else math.inf
