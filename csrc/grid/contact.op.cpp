@@ -6,13 +6,11 @@
 namespace mpm {
 namespace {
 
-// Callers that know no walls leave the last two arguments out.
-#define MPM_CONTACT_SCHEMA \
-  "Tensor velocity, " MPM_OBSTACLES_SCHEMA ", " MPM_TOPOLOGY_SCHEMA ", int[] wall_kind=[], float[] wall_plane=[]"
+#define MPM_CONTACT_SCHEMA "Tensor velocity, " MPM_OBSTACLES_SCHEMA ", " MPM_TOPOLOGY_SCHEMA
 #define MPM_CONTACT_PARAMETERS                                                          \
   const Tensor &velocity, MPM_OBSTACLES_PARAMETERS, const std::vector<Tensor>&topology, \
-      const std::vector<double>&lattice, const std::vector<int64_t>&layout, MPM_CONTACT_WALLS_PARAMETERS
-#define MPM_CONTACT_ARGUMENTS velocity, MPM_OBSTACLES_ARGUMENTS, topology, lattice, layout, wall_kind, wall_plane
+      const std::vector<double>&lattice, const std::vector<int64_t>&layout
+#define MPM_CONTACT_ARGUMENTS velocity, MPM_OBSTACLES_ARGUMENTS, topology, lattice, layout
 
 void check_velocity(const Tensor& velocity) {
   STD_TORCH_CHECK(velocity.dim() == 2 && (velocity.size(1) == 2 || velocity.size(1) == 3),
@@ -25,7 +23,6 @@ ContactArguments<T, D> contact_arguments(MPM_CONTACT_PARAMETERS) {
   const PackedTopology blocks(topology, lattice, layout);
   auto a = obstacle_arguments<T, D>(velocity, blocks, MPM_OBSTACLES_ARGUMENTS);
   check_scenes(a, blocks.scenes<T, D>(velocity));
-  set_walls(a, wall_kind, wall_plane);
   a.max_blocks = blocks.max_blocks<D>();
   a.block = blocks.block_pointer(velocity);
   const auto v = node_input<T>(velocity, "velocity", velocity, blocks.node_count<D>());

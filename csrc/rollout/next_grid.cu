@@ -2,7 +2,6 @@
 
 #include "cuda/chain.cuh"
 #include "cuda/fixed_point.cuh"
-#include "grid/contact.h"
 
 namespace mpm::cuda {
 namespace {
@@ -25,7 +24,7 @@ struct Node {
   int slot, local;
   SlotUpdate<T, D> there;
   ContactSlot<T, D> contact;
-  NodeContact<T, D> touched;
+  FirstTouch<T, D> touch;
 
   __device__ int64_t row() const { return int64_t(slot) * kBlockNodes<D> + local; }
   __device__ bool is_in_use() const { return there.active; }
@@ -37,22 +36,20 @@ struct Node {
   __device__ void find(const NextGridArguments<T, D>& a, int at) {
     slot = at;
     there = slot_update(a.update, slot);
-    touched.count = 0;
+    touch.obstacle = a.contact.obstacles;
   }
   __device__ void find_obstacles(const NextGridArguments<T, D>& a) {
     contact = contact_slot(a.contact, there.scene, there.corner);
-    if (contact.near)
-      touched = contact_of_node(SlotPoses<T, D>(a.contact, contact), node_position(a.contact, contact.corner, local));
+    touch = first_touch(a.contact, contact, node_position(a.contact, contact.corner, local));
   }
 };
 
 template <bool Obstacles, class T, int D>
 __device__ void take_node(const NextGridArguments<T, D>& a, const Node<T, D>& node) {
   NodeRow<T, D> row = update_node(a.update, node.there, node.local, node.sums(a));
-  if constexpr (Obstacles) {
-    if (node.touched.count > 0)
-      row.value = after_contact(SlotPoses<T, D>(a.contact, node.contact), node.touched, row.value);
-  }
+  if constexpr (Obstacles)
+    row.value = after_obstacles(a.contact, node.contact, node.touch,
+                                node_position(a.contact, node.contact.corner, node.local), row.value);
   if (a.watched && goes_far(a.update, node.there, row)) atomicOr(&a.watched->lost, Drift::kLost);
   a.update.updated[node.row()] = row;
   if (a.emptied) NodeRows<T, D>::empty(a.emptied, node.row(), a.fixed);

@@ -66,8 +66,6 @@ class Built:
     materials: list[Material]
     nozzles: list[Nozzle]
     scenes: list[str]
-    projected: Tensor | None = None
-    """Particles of each scene that were moved out of obstacles, int64 [B]; None unless the scene wants that."""
 
     def emissions(self) -> list[tuple[float, int]]:
         """(time, nozzle) of every layer, in the order of appearance."""
@@ -158,12 +156,9 @@ def build(scene: Any, device: torch.device) -> Built:
     )
     ids = torch.arange(len(first), device=device)
     state = step.prepare(first.replace(ids=ids))
-    moved = None
-    if scene.project:
-        state, moved = step.project(state)
     _check_fields(scene, state)
     nozzles = [Nozzle(step.prepare(n.layer), n.material, n.times) for n in nozzles]
-    return Built(grid, step, state, torch.cat(material), mixture.materials, nozzles, [e.name for e in entries], moved)
+    return Built(grid, step, state, torch.cat(material), mixture.materials, nozzles, [e.name for e in entries])
 
 
 def _named(key: str, make: Callable[..., Any], *arguments: Any, **options: Any) -> Any:

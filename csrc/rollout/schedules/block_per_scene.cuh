@@ -1,6 +1,5 @@
 #pragma once
 
-#include "grid/contact.h"
 #include "rollout/schedules/block_per_scene.h"
 #include "transfer/advance_gather.cuh"
 #include "transfer/scatter.cuh"
@@ -467,7 +466,9 @@ class SceneStep {
       NodeRow<T, D> row = update_node(update, slot_update(update, slot), local, node);
       if (a.obstacles) {
         const ContactSlot<T, D> there = contact_slot(contact, slot);
-        row.value = after_contact(contact, there, node_position(contact, there.corner, local), row.value);
+        if (there.active)
+          row.value = after_obstacles(contact, there, contact.obstacles, node_position(contact, there.corner, local),
+                                      row.value);
       }
       node = row;
     }

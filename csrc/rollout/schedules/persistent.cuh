@@ -1,7 +1,6 @@
 #pragma once
 
 #include "cuda/barrier.cuh"
-#include "grid/contact.h"
 #include "grid/status.h"
 #include "rollout/plan.h"
 #include "rollout/schedules/persistent.h"
@@ -33,7 +32,7 @@ struct NodeVelocities {
     Vector<T, D> v = update_node(update, there, local, node).value;
     if (!obstacles) return v;
     const ContactSlot<T, D> s = contact_slot(contact, there.scene, there.corner);
-    return after_contact(contact, s, node_position(contact, s.corner, local), v);
+    return s.active ? after_obstacles(contact, s, contact.obstacles, node_position(contact, s.corner, local), v) : v;
   }
 };
 
