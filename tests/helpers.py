@@ -179,7 +179,7 @@ def command(*arguments, **options):
 
 
 def scene_command(folder: Path, name: str, override: str) -> list[str]:
-    """Arguments of `check` or `run` with a small scene file in a folder, one key of which is overridden."""
+    """Arguments of `check` or `run` with a small scene file in a folder and one overridden key."""
     scene = folder / "scene.toml"
     scene.write_text(FILE.format(duration=0.04))
     where = ["-o", str(folder / "out"), "--quiet"] if name == "run" else []

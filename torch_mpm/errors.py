@@ -80,7 +80,7 @@ def check_real(name: str, value: Any, kinds: str = "a number") -> float:
     """A number that a float can hold, including infinity and NaN; `kinds` describes other accepted types."""
     if not isinstance(value, REAL):
         raise TypeError(f"{name} must be {kinds}, got {_described(value)}")
-    if isinstance(value, int) and abs(value) > LARGEST[torch.float64]:
+    if isinstance(value, int) and not is_finite(value):
         raise ValueError(f"{name} must be finite, got a whole number of {value.bit_length()} bits")
     return value  # type: ignore[return-value]
 

@@ -2,8 +2,8 @@
 
     python -m benchmarks.fuzz.interruptions --kills 100 --signals 100 --seed 0
 
-`run`, `generate`, `export` and `render` are each killed (SIGKILL) and signalled (SIGINT or SIGTERM) so many times, then
-called again. Their files must have the bytes of those of an undisturbed call, and nothing else may lie beside them.
+Each of `run`, `generate`, `export` and `render` gets SIGKILL `--kills` times and SIGINT or SIGTERM `--signals` times,
+and is called again. Its files must have the bytes of an undisturbed call, and nothing else may lie beside them.
 After a signal a command has `SOON` seconds of CPU time to end with the exit status of the signal; in a part of the
 cases it is one whose frames, scenes or shards take much longer. The exit status is 1 if there is a fault.
 """

@@ -72,8 +72,8 @@ def mutated(rng: random.Random) -> tuple[str, bool]:
 
 
 def mistakes(words: dict[str, Any], values: list[Any], rng: random.Random) -> bool:
-    """Make one to three mistakes in the words of a file, with values among others; returns whether it must be refused,
-    for a key that nobody knows."""
+    """Make one to three mistakes in the words of a file, with values among others; return whether one of them is an
+    unknown key, so that the file must be refused."""
     wrong = False
     for _ in range(rng.randint(1, 3)):
         holder, key = rng.choice(list(_places(words)))

@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
+from cases.matrices import rotations
 from torch import Tensor
 
 import torch_mpm as mpm
@@ -37,13 +38,6 @@ SAND_FORMS = [
     *(("unilateral", flow, "keep") for flow in ("radial", "exact")),
 ]
 SAND_OPTIONS = list(itertools.product((False, True), repeat=3))
-
-
-def rotations(count: int, dim: int) -> Tensor:
-    Q, R = torch.linalg.qr(torch.randn(count, dim, dim, dtype=torch.float64))
-    Q = Q * R.diagonal(dim1=1, dim2=2).sign()[:, None, :]
-    Q[:, :, 0] *= torch.linalg.det(Q).sign()[:, None]
-    return Q
 
 
 def strains(count: int, dim: int) -> Tensor:

@@ -5,7 +5,8 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from cases.plasticity import data, deformation, error, random_states, rotations, state_of, to
+from cases.matrices import deformation, rotations
+from cases.plasticity import data, error, random_states, state_of, to
 from helpers import TOLERANCE
 from torch import Tensor
 

@@ -12,6 +12,7 @@ import mpmath
 import numpy as np
 import pytest
 import torch
+from cases.matrices import deformation, rotations
 from torch import Tensor
 
 import torch_mpm as mpm
@@ -28,18 +29,6 @@ FORMS = [
 ]
 COEFFICIENT = 6.254421582537118
 KLAR = (*(math.radians(v) for v in (35, 9)), 0.2, math.radians(10))
-
-
-def rotations(count: int, dim: int) -> Tensor:
-    Q, R = torch.linalg.qr(torch.randn(count, dim, dim, dtype=torch.float64))
-    Q = Q * R.diagonal(dim1=1, dim2=2).sign()[:, None, :]
-    Q[:, :, 0] *= torch.linalg.det(Q).sign()[:, None]
-    return Q
-
-
-def deformation(h: Tensor) -> Tensor:
-    """Deformation gradients of given Hencky strains [P, D] with random axes."""
-    return rotations(*h.shape) * h.exp()[:, None, :] @ rotations(*h.shape).mT
 
 
 def hencky(F: Tensor) -> Tensor:

@@ -4,7 +4,8 @@ import math
 
 import pytest
 import torch
-from cases.plasticity import data, error, random_states, rotations, state_of, to
+from cases.matrices import rotations
+from cases.plasticity import data, error, random_states, state_of, to
 from helpers import TOLERANCE
 
 import torch_mpm as mpm

@@ -2,19 +2,13 @@
 
 import pytest
 import torch
+from cases.matrices import rotations
 from torch import Tensor
 
 import torch_mpm as mpm
 from torch_mpm.reference import svd as reference
 
 DTYPES = [torch.float32, torch.float64]
-
-
-def rotations(count: int, dim: int) -> Tensor:
-    Q, R = torch.linalg.qr(torch.randn(count, dim, dim, dtype=torch.float64))
-    Q = Q * R.diagonal(dim1=1, dim2=2).sign()[:, None, :]
-    Q[:, :, 0] *= torch.linalg.det(Q).sign()[:, None]
-    return Q
 
 
 def with_singular_values(sigma: Tensor) -> Tensor:

@@ -253,7 +253,7 @@ class _Steps:
 
 
 class _Call:
-    """One call of a recording, whose steps are taken again in its backward pass where other calls have come since."""
+    """One call of a recording. Its backward pass recomputes the steps if another call has used the recording since."""
 
     def __init__(self, step: nn.Module, recordings: Recordings, recording: _Recording) -> None:
         self._step, self._recordings, self.recording = step, recordings, recording

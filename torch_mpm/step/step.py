@@ -27,7 +27,7 @@ from ..laws.material import Material
 from ..laws.mixture import Mixture
 from ..laws.parameters import Overlay, TensorModule
 from ..ops import Survey, fusible, g2p, gather, grid_update, p2g, wall_impulses
-from ..ops.arguments import check_choice, soa_empty, split_dt
+from ..ops.arguments import check_choice, soa_empty
 from ..ops.contact import MAX_OBSTACLES
 from ..ops.g2p_advance import g2p_advance_compensated
 from ..ops.transfer import STRESS_FORMS
@@ -534,8 +534,6 @@ class Step(TensorModule):
         """
         from ..rollouts import plan_rollout
 
-        check_state(state)
-        split_dt(dt, self.grid.scenes, state.x)
         first, *others = str(plan_rollout(self, state, n, dt)).splitlines()
         if self.with_residual(state, dt).x_residual is not None:
             first += ", with compensated positions"

@@ -5,8 +5,8 @@
 // The schedule of scenes that stay on a multiprocessor each, on CUDA.
 namespace mpm {
 
-// n substeps, after the activation of the first one, of particles that move in place. That one follows so many substeps
-// of the call, and begins at a time.
+// Takes n substeps of particles that move in place, after the activation of the first of them, which follows `after`
+// substeps of the call and begins at `time`.
 template <class T, int D>
 void take_scenes(Substeps<T, D>& s, int64_t n, int64_t after, double time, const int* activated, int* status,
                  backend::Stream stream) {
