@@ -94,6 +94,7 @@ def test_wheel_has_the_libraries_of_every_machine(clean_copy: Path, tmp_path: Pa
         build = json.loads(contents.read("torch_mpm/lib/build.json"))
     libraries = {"torch_mpm/lib/libtorch_mpm_cpu.so", "torch_mpm/lib/libtorch_mpm_cuda.so", "torch_mpm/py.typed"}
     assert libraries | {name for name in tracked("--others") if name.startswith("torch_mpm/")} <= names
+    assert {name.partition("/")[0].partition("-")[0] for name in names} == {"torch_mpm"}, "tests are not in the wheel"
     assert build["cuda"]["archs"] == ["8.0", "9.0"]
     assert build["cpu"]["isa"] == (["baseline", "avx2", "avx512"] if platform.machine() == "x86_64" else ["baseline"])
 

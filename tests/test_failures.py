@@ -6,9 +6,9 @@ import pickle
 import pytest
 import torch
 from helpers import random_particles
+from oracle import advance, transfer
 
 import torch_mpm as mpm
-from torch_mpm.reference import advance, transfer
 
 NONE = [0, 0, -1, 0, -1, 0, -1, 0]
 

@@ -6,11 +6,11 @@ import pytest
 import torch
 from cases.impulses import DT, F64, GRAVITY, LAWS, STEPS, WALLS, cloud, grid_of, obstacles, one_by_one
 from helpers import TOLERANCE, random_blocks, random_nodes, relative_error
+from oracle import impulses as reference
 from torch import Tensor
 
 import torch_mpm as mpm
 from torch_mpm import ops
-from torch_mpm.reference import impulses as reference
 
 TRANSFERS = {"apic": {}, "pic": {"transfer": "pic"}, "flip": {"transfer": "flip"}, "blend": {"flip": 0.7}}
 

@@ -24,6 +24,12 @@ def test_old_import_paths(old, monkeypatch):
         module.no_such_thing  # noqa: B018
 
 
+def test_removed_modules():
+    message = r"torch_mpm.reference is not part of the package: .* `oracle` in tests/"
+    with pytest.raises(ModuleNotFoundError, match=message):
+        importlib.import_module("torch_mpm.reference.transfer")
+
+
 def test_an_attribute_of_the_package(monkeypatch):
     monkeypatch.delitem(sys.modules, "torch_mpm.checkpoints", raising=False)
     monkeypatch.delitem(vars(mpm), "checkpoints", raising=False)

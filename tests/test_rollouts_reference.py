@@ -4,11 +4,11 @@ import pytest
 import torch
 from cases.steps import block_state
 from helpers import TOLERANCE, relative_error
+from oracle import advance, contact, grid_update, material, sand, transfer
 from torch import Tensor
 
 import torch_mpm as mpm
 from torch_mpm.grid.topology import PADDING
-from torch_mpm.reference import advance, contact, grid_update, material, sand, transfer
 
 F64 = torch.float64
 DT, N = 1e-3, 6

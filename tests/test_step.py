@@ -4,10 +4,10 @@ import pytest
 import torch
 from cases.steps import block_state, make_step
 from helpers import TOLERANCE, random_particles, relative_error
+from oracle import grid_update as grid_reference
+from oracle import transfer as reference
 
 import torch_mpm as mpm
-from torch_mpm.reference import grid_update as grid_reference
-from torch_mpm.reference import transfer as reference
 
 
 def mpm88(device):

@@ -54,6 +54,8 @@ MOVED = {
     "view_server": "render.viewer_server",
 }
 """New path of each old one, both relative to the package."""
+REMOVED = {"reference": "the ops in plain torch are an aid of tests: the package `oracle` in tests/ of the sources"}
+"""Modules that are no longer part of the package, and where their contents are."""
 
 
 class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
@@ -61,6 +63,8 @@ class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 
     def find_spec(self, name: str, path: Any = None, target: Any = None) -> importlib.machinery.ModuleSpec | None:
         package, _, old = name.rpartition(".")
+        if package == PACKAGE and old in REMOVED:
+            raise ModuleNotFoundError(f"{name} is not part of the package: {REMOVED[old]}", name=name)
         return importlib.machinery.ModuleSpec(name, self) if package == PACKAGE and old in MOVED else None
 
     def create_module(self, spec: importlib.machinery.ModuleSpec) -> None:

@@ -22,9 +22,9 @@ from torch import Tensor
 
 import torch_mpm as mpm
 from torch_mpm.ops import gather, heat_operator, scatter
-from torch_mpm.reference.heat import HeatOperator
 
 from .. import common, regressions
+from ..heat_matrix import node_gradients
 from ..stability.heat import assembled
 from .timing import Clock
 
@@ -62,19 +62,18 @@ class Problem:
 
 def csr(p: Problem) -> Tensor:
     """The nonzeros of H on the nodes with heat capacity as a CSR matrix."""
-    operator, dim = HeatOperator, 3
-    N, width = p.blocks.node_count, 5
+    N, dim, width = p.blocks.node_count, 3, 5
     values = p.x.new_zeros(N * width**dim)
     offsets = list(itertools.product(range(3), repeat=dim))
     for first in range(0, len(p.x), CHUNK):
         part = slice(first, first + CHUNK)
-        h = operator.at(p.blocks, p.x[part], p.conductance[part])
+        rows, gradient = node_gradients(p.blocks, p.x[part])
         for (i, a), (j, b) in itertools.product(enumerate(offsets), repeat=2):
             entry = 0
             for s, t in zip(a, b, strict=True):
                 entry = entry * width + t - s + 2
-            value = h.conductance * (h.gradient[:, i] * h.gradient[:, j]).sum(1)
-            values.index_add_(0, h.support.rows[:, i] * width**dim + entry, value)
+            value = p.conductance[part] * (gradient[:, i] * gradient[:, j]).sum(1)
+            values.index_add_(0, rows[:, i] * width**dim + entry, value)
     used = int((p.blocks.block >= 0).sum()) * p.blocks.grid.nodes_per_block
     row = torch.arange(N, dtype=torch.float32, device=p.x.device)[:, None] + 1
     dense = p.blocks.to_dense(row)[0, ..., 0].round().int() - 1
@@ -88,8 +87,8 @@ def csr(p: Problem) -> Tensor:
     kept = (table != 0) & (columns >= 0) & some[:, None]
     start = torch.nn.functional.pad(kept.sum(1)[some].cumsum(0), (1, 0)).int()
     number = (some.cumsum(0) - 1).int()
-    rows = len(start) - 1
-    return torch.sparse_csr_tensor(start, number[columns[kept].long()], table[kept], (rows, rows))
+    size = len(start) - 1
+    return torch.sparse_csr_tensor(start, number[columns[kept].long()], table[kept], (size, size))
 
 
 def csr_cg(H: Tensor, weight: Tensor, diagonal: Tensor, b: Tensor, iterations: int) -> Tensor:

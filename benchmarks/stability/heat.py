@@ -21,9 +21,9 @@ from torch import Tensor
 
 import torch_mpm as mpm
 from torch_mpm.ops import scatter
-from torch_mpm.reference.heat import HeatOperator
 
 from .. import common
+from ..heat_matrix import node_gradients
 
 NUMBERS = (1e-5, 1e-3, 0.1, 1.0, 10.0, 100.0, 1e4, 1e6)
 CONTRASTS = (1.0, 1e3, 1e6)
@@ -40,14 +40,14 @@ KINDS = (
 
 def assembled(blocks: mpm.Blocks, x: Tensor, conductance: Tensor) -> sparse.csr_matrix:
     """H as a sparse matrix in float64 on the rows of node tensors: Gᵀ κ V G per axis, G the gradient of a particle."""
-    operator = HeatOperator.at(blocks, x.double(), conductance.double())
-    P, S, D = operator.gradient.shape
+    nodes, gradient = node_gradients(blocks, x.double())
+    P, S, D = gradient.shape
     rows = torch.arange(P).repeat_interleave(S).numpy()
-    columns = operator.support.rows.reshape(-1).numpy()
+    columns = nodes.reshape(-1).numpy()
     weight = sparse.diags(conductance.double().numpy())
     total = sparse.csr_matrix((blocks.node_count, blocks.node_count))
     for axis in range(D):
-        values = operator.gradient[:, :, axis].reshape(-1).numpy()
+        values = gradient[:, :, axis].reshape(-1).numpy()
         G = sparse.csr_matrix((values, (rows, columns)), shape=(P, blocks.node_count))
         total = total + G.T @ weight @ G
     return total.tocsr()

@@ -25,9 +25,9 @@ from torch import Tensor
 
 import torch_mpm as mpm
 from torch_mpm.heat.boundaries import Convection, Fixed, FreeSurface, HeatNodes
-from torch_mpm.reference.heat import HeatOperator
 
 from .. import common
+from ..heat_matrix import node_gradients
 
 TRANSFERS = ("hybrid", "apic", "flip", "pic")
 NUMBERS = (1e-3, 0.05, 1.0, 1e3, 1e6)
@@ -80,11 +80,10 @@ class Exact(mpm.Heat):
 
         sites = torch.arange(dense[0].numel()).reshape(1, *lattice, 1).expand(dense.shape)
         site = blocks.from_dense(sites)[:, 0]  # of each row
-        operator = HeatOperator.at(blocks, nodes.state.x, nodes.conductance)
-        P, S, D = operator.gradient[particles].shape
-        support = site[operator.support.rows[particles]]
+        rows, gradients = (values[particles] for values in node_gradients(blocks, nodes.state.x))
+        P, S, D = gradients.shape
         gradient = dense.new_zeros(P, D, dense[0].numel())
-        gradient.scatter_add_(2, support[:, None].expand(P, D, S), operator.gradient[particles].mT)
+        gradient.scatter_add_(2, site[rows][:, None].expand(P, D, S), gradients.mT)
         W = (dt * nodes.conductance[particles]).sqrt()[:, None, None] * gradient
         W = W.flatten(0, 1)
         if nodes.exchange is not None:
@@ -92,12 +91,12 @@ class Exact(mpm.Heat):
         free = nodes.heat_capacity > 0
         if nodes.fixed is not None:
             free &= ~nodes.fixed
-        rows = by_site(free)[0].nonzero()[:, 0]
-        root = by_site(nodes.heat_capacity)[0, rows].sqrt()
-        _, sigma, V = torch.linalg.svd(W[:, rows] / root, full_matrices=False)
+        solved = by_site(free)[0].nonzero()[:, 0]
+        root = by_site(nodes.heat_capacity)[0, solved].sqrt()
+        _, sigma, V = torch.linalg.svd(W[:, solved] / root, full_matrices=False)
         decay = V.T * (sigma**2 / (1 + sigma**2)) @ V
         after = by_site(torch.where(free, nodes.theta, 0))
-        after[:, rows] -= (after[:, rows] * root) @ decay / root
+        after[:, solved] -= (after[:, solved] * root) @ decay / root
         return blocks.from_dense(after.reshape(dense.shape))[:, 0] - nodes.theta
 
 

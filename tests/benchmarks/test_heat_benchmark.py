@@ -2,10 +2,21 @@
 
 from pathlib import Path
 
-from helpers import result, run_quick
+import torch
+from helpers import random_particles, result, run_quick
+from oracle.heat import HeatOperator
 
 from benchmarks import report
 from benchmarks.accuracy.heat_fronts import root
+from benchmarks.heat_matrix import node_gradients
+
+
+def test_gradients_of_the_heat_matrix(dim: int, kernel: str) -> None:
+    p = random_particles(dim, kernel)
+    rows, gradient = node_gradients(p.blocks(), p.x)
+    expected = HeatOperator.at(p.blocks(), p.x, p.mass)
+    assert torch.equal(rows, expected.support.rows)
+    torch.testing.assert_close(gradient, expected.gradient, rtol=1e-12, atol=1e-13)
 
 
 def test_heat_benchmark(tmp_path: Path) -> None:

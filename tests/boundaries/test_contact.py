@@ -5,13 +5,13 @@ import math
 import pytest
 import torch
 from helpers import random_blocks
+from oracle.contact import contact_velocity
 from torch import Tensor
 
 import torch_mpm as mpm
 from torch_mpm.boundaries import Obstacle
 from torch_mpm.geometry.shapes import Cylinder, Shape
 from torch_mpm.ops import contact, fusible
-from torch_mpm.reference.contact import contact_velocity
 
 KINDS = ["sticky", "slip", "separate"]
 

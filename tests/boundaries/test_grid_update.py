@@ -6,11 +6,11 @@ import math
 import pytest
 import torch
 from helpers import random_blocks, random_nodes, relative_error
+from oracle.grid_update import grid_update as reference
 from torch import Tensor
 
 import torch_mpm as mpm
 from torch_mpm.ops import grid_update
-from torch_mpm.reference.grid_update import grid_update as reference
 
 INSET = {
     2: mpm.Walls([("separate", "sticky"), ("slip", "open")], (0.15, 0.2), (0.61, 0.7), [(0.3, 0.0), 0.2]),

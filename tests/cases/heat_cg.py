@@ -4,11 +4,11 @@ import dataclasses
 
 import torch
 from helpers import Particles, random_particles
+from oracle import heat as reference
 from torch import Tensor
 
 import torch_mpm as mpm
 from torch_mpm.ops import heat_operator, scatter
-from torch_mpm.reference import heat as reference
 
 
 @dataclasses.dataclass

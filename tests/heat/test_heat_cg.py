@@ -7,11 +7,11 @@ import pytest
 import torch
 from cases.heat_cg import check_replay, dense_increment, dense_operator, heat, op_arguments
 from helpers import TOLERANCE, relative_error
+from oracle import heat as reference
 from torch import Tensor
 
 import torch_mpm as mpm
 from torch_mpm.ops import heat_operator, scatter
-from torch_mpm.reference import heat as reference
 
 NONDETERMINISTIC = 1e-8
 """Atomic sums on CUDA have no order."""

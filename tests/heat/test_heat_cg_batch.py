@@ -6,8 +6,7 @@ import pytest
 import torch
 from cases.heat_cg import check_replay, heat
 from helpers import relative_error
-
-from torch_mpm.reference import heat as reference
+from oracle import heat as reference
 
 SIZES = tuple((37 * n) % 60 if n % 5 else 0 for n in range(150))
 

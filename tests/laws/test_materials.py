@@ -5,11 +5,11 @@ import math
 import pytest
 import torch
 from helpers import relative_error
+from oracle import material as reference
 from torch import Tensor
 
 import torch_mpm as mpm
 from torch_mpm import ops
-from torch_mpm.reference import material as reference
 
 LAWS = sorted(reference.LAWS)
 SCENES = 3

@@ -8,13 +8,13 @@ import torch
 from cases.matrices import deformation, rotations
 from cases.plasticity import data, error, random_states, state_of, to
 from helpers import TOLERANCE
+from oracle import principal as reference
 from torch import Tensor
 
 import torch_mpm as mpm
 from torch_mpm import ops
 from torch_mpm.ops import law_energy, law_stiffness, law_update, law_wave_modulus
 from torch_mpm.ops.law import ELASTIC, INVALID, PLASTIC
-from torch_mpm.reference import principal as reference
 
 LAWS = sorted(reference.LAWS)
 PLASTIC_LAWS = [name for name in LAWS if reference.LAWS[name].flow is not None]

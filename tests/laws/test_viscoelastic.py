@@ -7,10 +7,10 @@ import torch
 from cases.matrices import rotations
 from cases.plasticity import data, error, random_states, state_of, to
 from helpers import TOLERANCE
+from oracle.viscoelastic import viscoelastic_update
 
 import torch_mpm as mpm
 from torch_mpm.ops import law_energy, law_update
-from torch_mpm.reference.viscoelastic import viscoelastic_update
 
 MU, LAM, BRANCH, TIME = 2.0, 3.0, 5.0, 0.1
 

@@ -3,9 +3,9 @@
 import pytest
 import torch
 from helpers import Particles, random_particles, relative_error
+from oracle import advance as reference
 
 import torch_mpm as mpm
-from torch_mpm.reference import advance as reference
 
 DT = 0.013
 CASES = [

@@ -5,14 +5,14 @@ import itertools
 import pytest
 import torch
 from helpers import random_particles, relative_error
+from oracle import implicit as oracle
+from oracle import material
 from torch import Tensor
 
 import torch_mpm as mpm
 from torch_mpm import ops
 from torch_mpm.implicit.mirrors import Mirrors
 from torch_mpm.ops.implicit import CONVERGED, NEGATIVE_CURVATURE, from_upper, tangent_entries, to_upper
-from torch_mpm.reference import implicit as oracle
-from torch_mpm.reference import material
 
 PARAMETERS = {
     "neo_hookean": (2.0, 3.0),

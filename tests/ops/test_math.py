@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 import torch
-
-from torch_mpm.reference.transfer import bspline
+from oracle.transfer import bspline
 
 math = pytest.importorskip("torch_mpm._math", reason="torch_mpm._math is built where Python.h is")
 

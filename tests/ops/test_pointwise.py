@@ -4,9 +4,9 @@ import math
 
 import pytest
 import torch
+from oracle import pointwise as reference
 
 from torch_mpm.ops.pointwise import FUNCTIONS, pointwise, row_shape
-from torch_mpm.reference import pointwise as reference
 
 NAMES = sorted(FUNCTIONS)
 ROWS = 37

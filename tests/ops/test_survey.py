@@ -4,11 +4,11 @@ import math
 
 import pytest
 import torch
+from oracle import cfl as reference
 
 import torch_mpm as mpm
 from tests.helpers import TOLERANCE
 from torch_mpm.ops import survey
-from torch_mpm.reference import cfl as reference
 from torch_mpm.step.stability import figures_of
 
 F64 = torch.float64

@@ -3,10 +3,10 @@
 import pytest
 import torch
 from cases.matrices import rotations
+from oracle import svd as reference
 from torch import Tensor
 
 import torch_mpm as mpm
-from torch_mpm.reference import svd as reference
 
 DTYPES = [torch.float32, torch.float64]
 

@@ -3,10 +3,10 @@
 import pytest
 import torch
 from helpers import Particles, random_particles, relative_error
+from oracle import transfer as reference
 
 import torch_mpm as mpm
 from torch_mpm.ops import gather, scatter
-from torch_mpm.reference import transfer as reference
 
 DT = 0.013
 CASES = [

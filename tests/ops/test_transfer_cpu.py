@@ -7,10 +7,10 @@ import sys
 import pytest
 import torch
 from helpers import TOLERANCE, relative_error
+from oracle import transfer as reference
 
 import torch_mpm as mpm
 from torch_mpm.info import info
-from torch_mpm.reference import transfer as reference
 
 OPS = torch.ops.torch_mpm
 DIMENSIONS = [2, 3]

@@ -7,7 +7,8 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from ..grid.topology import Topology
+from torch_mpm.grid.topology import Topology
+
 from . import transfer
 
 

@@ -9,7 +9,7 @@ import math
 import torch
 from torch import Tensor
 
-from ..grid.topology import BLOCK_WIDTH, PADDING, Topology
+from torch_mpm.grid.topology import BLOCK_WIDTH, PADDING, Topology
 
 
 def bspline(distance: Tensor, order: int) -> Tensor:

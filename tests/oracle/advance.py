@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..grid.grid import Blocks
+from torch_mpm.grid.grid import Blocks
+
 from . import transfer
 
 

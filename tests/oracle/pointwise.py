@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..geometry.vectors import determinant, norm
+from torch_mpm.geometry.vectors import determinant, norm
 
 
 def heat_weights(rest: Tensor, J: Tensor, F: Tensor, C: Tensor, kappa: Tensor, mass: Tensor, dt: Tensor, L: Tensor,

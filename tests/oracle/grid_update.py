@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from ..grid.topology import BLOCK_WIDTH, PADDING
+from torch_mpm.grid.topology import BLOCK_WIDTH, PADDING
+
 from .contact import contact_velocity
 
 if TYPE_CHECKING:
-    from ..boundaries import Face
-    from ..grid.topology import Topology
+    from torch_mpm.boundaries import Face
+    from torch_mpm.grid.topology import Topology
 
 MIRROR_REACH = 2
 """Nodes on both sides of a mirror that have images (csrc/grid/grid_update.h)."""

@@ -7,7 +7,8 @@ import dataclasses
 import torch
 from torch import Tensor
 
-from ..grid.grid import Blocks
+from torch_mpm.grid.grid import Blocks
+
 from .transfer import Support, support
 
 

@@ -7,8 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-from ..grid.grid import Grid
-from ..state.state import State
+from torch_mpm.grid.grid import Grid
+from torch_mpm.state.state import State
 
 LARGEST_CHANGE = 0.5
 """Maximum relative change of a stretch or of the volume of a particle in one step."""

@@ -11,8 +11,8 @@ from torch import Tensor
 from .grid_update import grid_update
 
 if TYPE_CHECKING:
-    from ..boundaries import Face
-    from ..grid.topology import Topology
+    from torch_mpm.boundaries import Face
+    from torch_mpm.grid.topology import Topology
 
 
 def moments(blocks: Topology, momentum: Tensor) -> Tensor:
