@@ -168,7 +168,7 @@ def test_times_of_scenes(device):
 
 
 def test_frames_add_up_to_their_end_in_float32(device):
-    """The clocks are in double precision, whatever the particles are in."""
+    """The clocks are in double precision, for every dtype of the particles."""
     step = step_of(2, STIFFNESS, scenes=3, device=device, dtype=torch.float32)
     state = batch(device, 2, torch.float32)
     with torch.no_grad():

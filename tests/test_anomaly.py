@@ -35,7 +35,7 @@ def backward(step, state, checkpoint=None, n=6):
 def test_the_operation_the_substep_and_the_scene_are_named(checkpoint, device):
     step, state = make(device)
     step.on_particles = root_of
-    assert bool(backward(step, state, checkpoint).isnan().any())  # nothing is said, and nothing is clipped
+    assert bool(backward(step, state, checkpoint).isnan().any())  # no warning, and nothing is clipped
     expected = r"the gradient of (Sqrt|Mul)Backward0 is NaN \(of its input 0\) in substep 3 of the rollout, scene 1$"
     with torch.autograd.detect_anomaly(), pytest.raises(RuntimeError, match=expected):
         backward(step, state, checkpoint)
@@ -56,12 +56,12 @@ def test_nodes_have_scenes_too(device):
 
 
 def test_the_ops_are_named(device):
-    """An op of the library; NaN that came from the loss is said to have come."""
+    """An op of the library; NaN from the loss is reported as such."""
     step, state = make(device)
     assert "in one op" in step.explain(state, DT)
     v = state.v.clone().requires_grad_()
     with torch.autograd.detect_anomaly():
-        assert "anomaly detection looks at every step" in step.explain(state, DT)
+        assert "anomaly detection inspects every step" in step.explain(state, DT)
         end = mpm.rollout(step, state.replace(v=v), 3, DT)
         loss = torch.zeros_like(end.x)
         loss[-1] = torch.nan

@@ -76,7 +76,7 @@ torch.cuda.empty_cache()  # refused by an allocator that stays in the capture
 assert torch.isfinite(mpm.rollout(step, state, 20, 1e-4).x).all()
 """
 FAILURES = {
-    "captured": "mpm.captured(Waiting(step, graph_segments.TRIALS + 1), state, 1e-4)",
+    "captured": "mpm.make_graphed_step(Waiting(step, graph_segments.TRIALS + 1), state, 1e-4)",
     "replays": "Replays(lambda s, w=Waiting(step, 1): w(s, 1e-4), state, step.grid.pool(state.x, None))",
 }
 

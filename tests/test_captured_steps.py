@@ -297,7 +297,7 @@ def test_on_the_cpu_steps_are_taken_as_without():
 
 def test_another_kind_is_recorded(device, recorded):
     step, state = learned(device)
-    advance = mpm.captured(step, None, DT, 2)
+    advance = mpm.make_graphed_step(step, None, DT, 2)
     assert not recorded
     made = 0
 
@@ -334,7 +334,7 @@ def test_another_kind_is_recorded(device, recorded):
 
 def test_the_latest_recordings_are_kept(device, recorded):
     step, _ = learned(device)
-    advance = mpm.captured(step, None, DT)
+    advance = mpm.make_graphed_step(step, None, DT)
     states = [blob(device, 2, 20 + k) for k in range(Recordings.most + 1)]
     with torch.no_grad():
         for state in (*states, states[-1], states[1], states[0]):
@@ -540,7 +540,7 @@ def test_a_step_that_was_moved_is_recorded(device, recorded):
 
 def test_hooks_and_tensors_elsewhere_are_refused(device, recorded):
     step, state = blown(device)
-    advance = mpm.captured(step, state, DT, n=2)
+    advance = mpm.make_graphed_step(step, state, DT, n=2)
     hook = step.law.register_forward_hook(lambda module, args, result: None)
     with pytest.raises(ValueError, match="step must have no hooks"):
         advance(state)
@@ -548,7 +548,7 @@ def test_hooks_and_tensors_elsewhere_are_refused(device, recorded):
     advance(state)
     step.register_buffer("elsewhere", torch.ones((), device="meta"))
     with pytest.raises(ValueError, match="step must be on the device of the state"):
-        mpm.captured(step, state, DT, n=2)
+        mpm.make_graphed_step(step, state, DT, n=2)
     if device == "cuda":
         assert "a tensor of it is on meta" in step.explain(state, DT)
 
@@ -567,12 +567,12 @@ def test_gradients_that_would_be_lost_are_refused(device, recorded):
 def test_what_is_wrong(device, recorded):
     step, state = learned(device)
     with pytest.raises(TypeError, match="step must be a Step or another module"):
-        mpm.captured(lambda state, dt: state, state, DT)
+        mpm.make_graphed_step(lambda state, dt: state, state, DT)
     with pytest.raises(TypeError, match="state"):
-        mpm.captured(step, None, DT)(state.x)
+        mpm.make_graphed_step(step, None, DT)(state.x)
     with pytest.raises(ValueError, match="n must be at least 1"):
-        mpm.captured(step, state, DT, 0)
-    advance = mpm.captured(step, state, DT, 2)
+        mpm.make_graphed_step(step, state, DT, 0)
+    advance = mpm.make_graphed_step(step, state, DT, 2)
     v = state.v.clone().requires_grad_()
     grad = torch.autograd.grad(advance(state.replace(v=v)).v.square().sum(), v, create_graph=True)[0]
     with pytest.raises(RuntimeError, match="once_differentiable"):

@@ -122,7 +122,7 @@ def test_checkpoints_of_torch_around_steps_of_a_grid_that_grows():
 
 @pytest.mark.parametrize("checkpoint", [None, 4, mpm.Checkpoints(states=3)])
 def test_steps_that_are_taken_again_do_not_count_again(checkpoint, device):
-    """A solver of heat that misses its tolerance says so once for each step, and a refused dt too."""
+    """A heat solver that misses its tolerance warns once per step; so does a refused dt."""
     step, state = make("heat", device)
     step.heat.max_iterations = 1
     dt = torch.tensor([-DT], dtype=torch.float64, device=device)

@@ -81,7 +81,7 @@ def in_calls(step: mpm.Step, state: mpm.State, dt: float | Tensor) -> mpm.State:
     return mpm.rollout(step, torch.load(file, weights_only=True), STEPS - 4, dt)
 
 
-def in_graphs(step: mpm.Step, state: mpm.State, dt: float | Tensor) -> mpm.State:
+def graphed_steps(step: mpm.Step, state: mpm.State, dt: float | Tensor) -> mpm.State:
     step.on_grid = lambda blocks, velocity, mass, dt: velocity
     return mpm.rollout(step, state, STEPS, dt, graph=4)
 
@@ -96,7 +96,7 @@ WAYS = (
     in_frames,
     with_a_path,
     in_calls,
-    in_graphs,
+    graphed_steps,
 )
 FORMS = {
     "number": lambda dt, x: dt,

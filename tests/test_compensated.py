@@ -56,7 +56,7 @@ WAYS = {
     "recorded": lambda step, state: mpm.rollout(
         step, state.replace(v=state.v.requires_grad_()), 200, DT, mpm.Checkpoints(memory=1e9)
     ),
-    "taken again": lambda step, state: mpm.rollout(step, state.replace(v=state.v.requires_grad_()), 200, DT, 50),
+    "recomputed": lambda step, state: mpm.rollout(step, state.replace(v=state.v.requires_grad_()), 200, DT, 50),
     "from Python": lambda step, state: mpm.rollout(lambda s, dt: step(s, dt), state, 200, DT),
 }
 

@@ -1,4 +1,4 @@
-"""The test session itself: a GPU is tested, or the session says why not."""
+"""The test session itself: a GPU is tested, or the session reports why not."""
 
 import os
 import subprocess

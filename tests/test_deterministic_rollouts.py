@@ -1,5 +1,5 @@
 """Rollouts on deterministic grids in float32, whose node sums are in fixed point on CUDA: the same bits in each run,
-and single steps in float64 to rounding, whatever kernels take them."""
+and single steps in float64 to rounding, for all kernels."""
 
 import pytest
 import torch
@@ -45,7 +45,7 @@ def test_more_particles_than_a_cluster_takes(dim, device):
 
 @pytest.mark.parametrize("high", [0.6, 0.65])
 def test_crowded_blocks(high, dim, device):
-    """The first run of a grid knows less of how many blocks there will be than the others."""
+    """The first run of a grid has no block count of an earlier one."""
     assert_repeats(make(dim), few.crowd(dim, device, high), 30, 5e-4, 1e-3)
 
 

@@ -1,4 +1,4 @@
-"""Programs of the documents that say that they run, one after another."""
+"""Programs of the documents that are marked as complete, one after another."""
 
 import re
 import sys

@@ -51,7 +51,7 @@ def test_more_particles_than_a_cluster_takes(transfer, dim, device):
 
 @pytest.mark.parametrize("high", [0.6, 0.65])
 def test_crowded_blocks(high, dim, device):
-    """Items have more particles than in steps of single kernels, once a call knows the small number of blocks."""
+    """Items have more particles than in steps of single kernels, once a call has the small number of blocks."""
     state = crowd(dim, device, high)
     step, single = make(dim, max_blocks=None), make(dim)
     with torch.no_grad():
@@ -73,7 +73,7 @@ def test_impulses_on_walls(dim, device):
 
 
 def test_a_domain_whose_blocks_all_have_room(dim, device):
-    """The second call knows how few blocks are active."""
+    """The second call has the number of active blocks."""
     step, single, state = make(dim, max_blocks=None), make(dim), body(dim, device)
     with torch.no_grad():
         half, _ = both(step, single, state, N, DT)

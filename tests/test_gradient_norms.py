@@ -1,4 +1,4 @@
-"""Norms of gradients inside rollouts: those of autograd at each state, and what they say about a truncation."""
+"""Norms of gradients inside rollouts: those of autograd at each state, and of truncated gradients."""
 
 import math
 

@@ -106,7 +106,7 @@ def test_functions_of_the_users_are_called_in_every_step():
     shape = mpm.SDF(lambda x: calls.append(1) or (x - 0.5).norm(dim=1) - 0.1, (0.0, 0.0))
     for boundaries in ([shape], [mpm.Sphere(lambda t: torch.full((2,), 0.5), 0.1)]):
         step.boundaries = boundaries
-        assert "something of the user's" in step.explain(state, DT)
+        assert "a user object" in step.explain(state, DT)
     step.boundaries = []
     wanted = state.v.clone().requires_grad_()
     end = mpm.rollout(step, state.replace(v=wanted), 12, DT)
@@ -121,7 +121,7 @@ def test_training_from_graphs(dim, n):
     state = step.prepare(blob("cuda", dim))
     F = state.F + 0.05 * torch.randn(state.F.shape, generator=torch.Generator().manual_seed(1), dtype=F64).to(state.F)
     state = state.replace(v=state.v.clone().requires_grad_(), F=F)
-    advance = mpm.captured(step, state, DT, n)
+    advance = mpm.make_graphed_step(step, state, DT, n)
     for k in range(3):
         v = (state.v.detach() * (1 - 0.1 * k)).requires_grad_()
         start = state.replace(v=v, time=0.1 * k)
@@ -144,7 +144,7 @@ def test_gradients_of_calls_add_up():
     step = mpm.Step(box(2, max_blocks=36), network(2, "cuda"))
     state = step.prepare(blob("cuda", 2))
     start = state.replace(F=state.F + 0.05 * torch.ones_like(state.F), v=state.v.clone().requires_grad_())
-    advance = mpm.captured(step, start, DT, 2)
+    advance = mpm.make_graphed_step(step, start, DT, 2)
     starts = [start.replace(v=(k * state.v).requires_grad_()) for k in (1.0, 3.0)]
 
     def gradients(take):
@@ -171,7 +171,7 @@ def test_fields_by_name_and_fields_that_go():
     a, b = torch.ones(300, device="cuda"), torch.zeros(300, device="cuda")
     state = state.replace(C=torch.zeros_like(state.F), extra={"a": a, "b": b})
     with torch.no_grad():
-        advance = mpm.captured(step, state, DT)
+        advance = mpm.make_graphed_step(step, state, DT)
         end = advance(state.replace(extra={"b": b, "a": a}))
     assert torch.equal(end.extra["a"], a) and torch.equal(end.extra["b"], b)
     assert end.C is None
@@ -185,7 +185,7 @@ def test_what_does_not_go_into_a_graph():
     law = network(2, "cuda")
     law.register_forward_hook(lambda *arguments: None)
     with pytest.raises(ValueError, match="must have no hooks"):
-        mpm.captured(mpm.Step(box(2), law), state, DT)
+        mpm.make_graphed_step(mpm.Step(box(2), law), state, DT)
 
 
 @pytest.mark.cuda
@@ -203,7 +203,7 @@ def test_rollouts_from_graphs_leave_nothing_behind():
         gc.collect()
         by_replays, by_steps = ([size_after(take) for _ in range(6)] for take in (mpm.rollout, one_by_one))
     assert len(step._activations.all()) == 1
-    # Some tools that watch a GPU keep the tensors of what Python calls.
+    # Some tools that watch a GPU keep the tensors of Python calls alive.
     assert by_replays[-1] - by_replays[0] <= by_steps[-1] - by_steps[0]
     step.check()
 
@@ -212,5 +212,5 @@ def test_a_graph_needs_a_gpu():
     step = mpm.Step(box(2), mpm.NeoHookean(E=1e4, nu=0.3))
     state = blob("cpu", 2)
     with pytest.raises(ValueError, match="state must be on a CUDA device, got cpu"):
-        mpm.captured(step, state, DT)
+        mpm.make_graphed_step(step, state, DT)
     assert tensors(mpm.rollout(step, state, 0, DT)).keys() == tensors(state).keys()

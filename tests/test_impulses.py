@@ -1,4 +1,4 @@
-"""Impulses on walls and obstacles: balance of momentum, known forces, gradients, and who counts what."""
+"""Impulses on walls and obstacles: balance of momentum, known forces, gradients, shares of boundaries."""
 
 import math
 
@@ -247,7 +247,7 @@ def test_a_held_ball_is_lifted_by_water(device):
     assert 0 < fine < 0.8 * coarse and fine < 0.2
 
 
-# ---- who counts what
+# ---- shares of boundaries
 
 
 def test_nothing_to_count(device):

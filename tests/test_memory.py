@@ -1,4 +1,4 @@
-"""Errors of memory are recognised in whatever words they come, and say what was wanted."""
+"""Errors of memory of all libraries are recognised, and name the amount that was requested."""
 
 import errno
 import os
@@ -111,7 +111,7 @@ def test_too_little_address_space_is_an_error_before_compiled_code_ends_the_proc
     from torch_mpm.data.hdf5 import h5py_module
 
     monkeypatch.setattr(host_memory, "_of_process", lambda: 1e6)
-    h5py_module()  # without a limit, whatever is free
+    h5py_module()  # without a limit, all free memory
     monkeypatch.setattr(host_memory, "_limit", lambda: 10**9)
     with pytest.raises(MemoryError, match=r"HDF5 takes about 16\.8 MB of address space, and 1 MB are available"):
         h5py_module()

@@ -1,4 +1,4 @@
-"""Old import paths of modules, which work for one release."""
+"""Old import paths of modules and old names, which work for one release."""
 
 import importlib
 import subprocess
@@ -7,7 +7,7 @@ import sys
 import pytest
 
 import torch_mpm as mpm
-from torch_mpm._moved import MOVED
+from torch_mpm._moved import MOVED, RENAMED
 
 
 @pytest.mark.parametrize("old", MOVED)
@@ -24,10 +24,17 @@ def test_old_import_paths(old, monkeypatch):
         module.no_such_thing  # noqa: B018
 
 
+<<<<<<< HEAD
 def test_removed_modules():
     message = r"torch_mpm.reference is not part of the package: .* `oracle` in tests/"
     with pytest.raises(ModuleNotFoundError, match=message):
         importlib.import_module("torch_mpm.reference.transfer")
+=======
+@pytest.mark.parametrize("old", RENAMED)
+def test_old_names(old):
+    with pytest.warns(DeprecationWarning, match=f"torch_mpm.{old} is now torch_mpm.{RENAMED[old]}"):
+        assert getattr(mpm, old) is getattr(mpm, RENAMED[old])
+>>>>>>> 25f37e6 (Names of graphed steps, results of rollout_to and sorting are those of the field; plainer sentences in rollouts, fuzz programs and tests)
 
 
 def test_an_attribute_of_the_package(monkeypatch):

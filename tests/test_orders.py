@@ -1,4 +1,4 @@
-"""Rollouts of particles in no order, which are sorted for many steps and put back."""
+"""Rollouts of unsorted particles, which are sorted for many steps and restored to their order."""
 
 import pytest
 import torch

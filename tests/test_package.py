@@ -1,4 +1,4 @@
-"""The built package: its libraries, what they need from torch, and what `info` says about them."""
+"""The built package: its libraries, their needs from torch, and the report of `info`."""
 
 import ast
 import json
@@ -74,7 +74,7 @@ def test_command_line_prints_info() -> None:
 
 
 def imported_modules(path: Path) -> set[str]:
-    """Full names of what a module of the package imports, anywhere in it."""
+    """Full names of all imports of a module of the package."""
     package = ("torch_mpm", *path.relative_to(PACKAGE).parts[:-1])
     found: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text())):

@@ -175,7 +175,7 @@ def test_as_many_scenes_as_particles_are_particles(device: str) -> None:
 
 
 def test_scenes_without_particles_count(device: str) -> None:
-    """A step knows how many scenes there are, and the state that it prepared too; a state alone does not."""
+    """A step, and a state that it prepared, has the number of scenes; a state alone does not."""
     state = batch(device).select(torch.arange(2 * EACH, device=device))
     law = mpm.NeoHookean(E=torch.tensor([1e3, 1e4, 1e5], device=device), nu=0.3)
     fresh = state.replace(time=0.0)

@@ -37,7 +37,7 @@ def by_dt(step: mpm.Step, end: mpm.State, dt: Tensor) -> dict[str, Tensor | None
 def test_laws(law, every, form, transfer, dim, device):
     step, state = case(law, dim, device, stress_form=form, transfer=transfer)
     dt = torch.tensor(DT, dtype=F64, device=device, requires_grad=True)
-    assert step.explain(state, dt).startswith("all steps between two kept states in one op")
+    assert step.explain(state, dt).startswith("all steps between two stored states in one op")
     got = by_dt(step, mpm.rollout(step, state, STEPS, dt, every), dt)
     expected = by_dt(step, one_by_one(step, state, STEPS, dt), dt)
     assert float(expected["dt"].norm()) > 0

@@ -47,7 +47,7 @@ def test_muscles(law, n, transfer, dtype, dim, device):
 @torch.no_grad()
 @pytest.mark.parametrize("sort", [False, True])
 def test_muscles_of_a_mixture(sort, dim, device):
-    """Some materials have muscles, and fibres come in the order of the particles whatever that is."""
+    """Some materials have muscles, and fibres follow the particles in any order."""
     d = fibres(dim, device)
     muscles = [mpm.Active(LAWS_HERE[name](), d) for name in ("von_mises", "neo_hookean")]
     laws = [LAWS_HERE["sand"](), muscles[0], LAWS_HERE["fluid"](), muscles[1]]

@@ -60,7 +60,7 @@ def test_laws(law, n, transfer, dim, dtype, device):
     with torch.no_grad():
         end, expected = mpm.rollout(step, state, n, 1e-4), one_by_one(step, state, n, 1e-4)
     assert_equal(end, expected)
-    for name, value in tensors(end).items():  # what is outside knows no sums over particles
+    for name, value in tensors(end).items():  # code outside has no sums over particles
         if value.is_floating_point():
             rounding = 100 * torch.finfo(dtype).eps * value[5].abs().max().clamp_min(1)
             assert float((value[5] - tensors(expected)[name][5]).abs().max()) <= float(rounding), name
@@ -384,7 +384,7 @@ def test_reasons_to_step_from_python(device):
 
 
 def test_nothing_that_may_have_a_gradient_is_lost(device):
-    """A function's own tensors are not seen; no_grad says that none is wanted."""
+    """Tensors of a user function are not detected; under no_grad there are no gradients."""
     stiffness = torch.tensor(1e4, dtype=F64, device=device, requires_grad=True)
     law = mpm.NeoHookean(mu=lambda temperature: stiffness + temperature, lam=1e3)
     step, state = mpm.Step(box(), law), blob(device)
@@ -501,7 +501,7 @@ def test_a_call_of_the_op_by_training_code(device, gradient):
         assert float((found - other).detach().abs().max() / other.detach().abs().max()) < TOLERANCE["rollout"][F64]
     names = [a.name for a in torch.ops.torch_mpm.substeps.default._schema.arguments]
     assert list(arguments) == names
-    with pytest.raises(ValueError, match="substeps` can take, got one of which it calls on_grid"):
+    with pytest.raises(ValueError, match="substeps` supports, got a step that it does not: it calls on_grid"):
         mpm.substeps_arguments(mpm.Step(box(), step.law, on_grid=lambda b, v, m, dt: v), state, 7, DT)
 
 

@@ -66,7 +66,7 @@ def hold(value: Any) -> tuple[mpm.Step, nn.Module]:
 
 
 def torch_ops(value: Any) -> tuple[mpm.Step, nn.Module]:
-    """An obstacle that the kernel does not know."""
+    """An obstacle without a kernel."""
     body = mpm.SDF(lambda x: x.norm(dim=1) - 0.15, value, "sticky")
     return mpm.Step(GRID, ELASTIC, boundaries=[body]), body
 

@@ -189,7 +189,7 @@ def test_checkpointing_changes_nothing(device):
 
 
 def test_scenes_in_a_batch_are_as_if_alone(device, dim):
-    """State, gradients with respect to the state, to E and gravity of each scene, whatever else is in the batch."""
+    """State, gradients with respect to the state, to E and gravity of each scene, for any other scenes."""
     E = torch.tensor([5e3, 1e4, 4e4], dtype=torch.float64, device=device)
     g = torch.tensor([[0.0] * dim, [-3.0] * dim, [2.0] * dim], dtype=torch.float64, device=device)
     dt = torch.tensor([1e-3, 2e-3, 5e-4], dtype=torch.float64, device=device)
@@ -304,7 +304,7 @@ def test_a_network_acts_on_the_grid_and_a_module_is_the_law(device):
 
 
 def test_who_looks_at_the_time():
-    """Moving obstacles and functions of the time do, in the heat too; and what the library does not know may."""
+    """Moving obstacles and functions of the time do, in the heat too; and unknown modules may."""
     heat = mpm.heat_boundaries
     still, moving = (mpm.Sphere((0.5, 0.5), 0.1, velocity=v) for v in (None, (1.0, 0.0)))
     quiet = [heat.FixedSurface(still, 1.0), heat.Convection(heat.FreeSurface(), 1.0, 2.0), heat.Source(lambda T: T)]
@@ -468,7 +468,7 @@ def test_a_step_is_captured_in_a_cuda_graph():
 @pytest.mark.cuda
 @pytest.mark.parametrize("inference", [False, True])
 def test_replays_of_a_graph_are_watched(inference):
-    """Problems of any replay are reported, whatever else happens to the step and to the memory between."""
+    """Problems of any replay are reported, also after other uses of the step and its memory."""
     step, state = mpm88("cuda")
     with torch.inference_mode(inference), torch.no_grad():
         static = step(state, 2e-4).map(torch.clone)

@@ -43,7 +43,7 @@ def throws(count, device="cpu"):
 
 
 def distance(step, states, n=3, **options):
-    """Mean over scenes of what they are after some steps."""
+    """Mean over scenes of their states after some steps."""
     end = mpm.rollout(step, mpm.State.concatenate(states, scene=True), n, DT, **options)
     return sum(part.x.pow(2).sum() + part.v.sum() for part in end.split(len(states))) / len(states)
 

@@ -24,7 +24,7 @@ def scene(kind: str, device: str) -> tuple[mpm.Step, mpm.State]:
         scenes = 8 if kind == "batch" else 100
         grid = box(3, scenes=scenes)
         state = state.replace(scene=(torch.arange(count, device=device) * scenes // count).int())
-    if kind == "heat":  # whose replays wait to know whether a pool must grow
+    if kind == "heat":  # whose replays wait for the block count of a growing pool
         grid = box(3, max_blocks=200)
         state = state.replace(temperature=torch.full_like(state.mass, 300.0))
     step = mpm.Step(grid, law, **options)

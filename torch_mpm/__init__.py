@@ -34,8 +34,8 @@ from .rollouts.environments import Environments
 from .rollouts.estimate import RolloutEstimate, estimate_rollout
 from .rollouts.frames import Frames, frames
 from .rollouts.gradient_norms import GradientNorms
-from .rollouts.graph_segments import captured
-from .rollouts.until_time import Arrival, rollout_to
+from .rollouts.graph_segments import make_graphed_step
+from .rollouts.until_time import RolloutToResult, rollout_to
 from .state import pytree
 from .state.state import State
 from .step import particle_operations
@@ -49,7 +49,6 @@ if TYPE_CHECKING:
 __all__ = [
     *laws.__all__,
     "SDF",
-    "Arrival",
     "Blocks",
     "Box",
     "Capsule",
@@ -71,6 +70,7 @@ __all__ = [
     "Revolved",
     "RolloutEstimate",
     "RolloutPlan",
+    "RolloutToResult",
     "SimulationError",
     "Sphere",
     "State",
@@ -89,6 +89,7 @@ __all__ = [
     "grid_update",
     "heat_boundaries",
     "heat_cg",
+    "make_graphed_step",
     "ops",
     "p2g",
     "particle_operations",
@@ -104,16 +105,21 @@ __all__ = [
     "svd3",
 ]
 
+captured = make_graphed_step
+"""Older name."""
+
 pytree.register()
 _moved.install()
 
 
 def __getattr__(name: str) -> Any:
-    """`Scene` needs the extra `scene`, so it is imported on first use."""
+    """`Scene`, imported on first use since it needs the extra `scene`, and old names."""
     if name == "Scene":
         from .scene import Scene
 
         return Scene
+    if name in _moved.RENAMED:
+        return _moved.renamed(name)
     if name in _moved.MOVED:
         return importlib.import_module(f"{__name__}.{name}")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

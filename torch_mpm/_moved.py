@@ -1,4 +1,4 @@
-"""Old import paths of modules, which work for one release with a warning."""
+"""Old import paths of modules and old names, which work for one release with a warning."""
 
 from __future__ import annotations
 
@@ -56,6 +56,8 @@ MOVED = {
 """New path of each old one, both relative to the package."""
 REMOVED = {"reference": "the ops in plain torch are an aid of tests: the package `oracle` in tests/ of the sources"}
 """Modules that are no longer part of the package, and where their contents are."""
+RENAMED = {"Arrival": "RolloutToResult"}
+"""New name of each old name of the package."""
 
 
 class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
@@ -74,11 +76,11 @@ class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         new = f"{PACKAGE}.{MOVED[module.__name__.rpartition('.')[2]]}"
         warnings.warn(f"{module.__name__} has moved to {new}", DeprecationWarning, stacklevel=2)
         target = importlib.import_module(new)
-        sys.modules[module.__name__] = target  # What the import returns.
+        sys.modules[module.__name__] = target  # The import returns this entry.
 
 
 def attributes_of(package: str, module: str) -> Callable[[str], Any]:
-    """A `__getattr__` for a package that was a module: the names of the module in it that has what it had."""
+    """A `__getattr__` for a package that was a module, for the names of a module in the package."""
 
     def attribute(name: str) -> Any:
         if not name.startswith("__"):
@@ -92,6 +94,12 @@ def attributes_of(package: str, module: str) -> Callable[[str], Any]:
     return attribute
 
 
+def renamed(name: str) -> Any:
+    """Attribute of the package by its old name."""
+    warnings.warn(f"{PACKAGE}.{name} is now {PACKAGE}.{RENAMED[name]}", DeprecationWarning, stacklevel=3)
+    return getattr(importlib.import_module(PACKAGE), RENAMED[name])
+
+
 def install() -> None:
-    """Let import statements find old paths, before any file of this name."""
+    """Install the finder of old paths, before the finders of files."""
     sys.meta_path.insert(0, _Finder())

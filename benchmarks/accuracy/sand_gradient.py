@@ -146,7 +146,7 @@ def text(result: dict[str, Any]) -> str:
             "",
             common.table(header, usual),
             "",
-            "What one unit in the last place of F changes in the float64 gradient, median and largest:",
+            "Change of the float64 gradient by one unit in the last place of F, median and largest:",
             "",
             common.table(header, units),
         ]

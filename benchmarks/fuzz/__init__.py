@@ -1,1 +1,1 @@
-"""Programs that try what nobody should do, each case in a child process; every program is bounded and seeded."""
+"""Fuzz programs: misuse of every interface, each case in a child process; every program is bounded and seeded."""

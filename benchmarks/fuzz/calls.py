@@ -44,22 +44,22 @@ INTERNAL = re.compile(
     r"Boolean value of Tensor|list index|indices must be|invalid combination of arguments|"
     r"has no len|(float|int)\(\) argument|unhashable|not subscriptable|can't multiply|only concatenate",
 )
-"""Messages about something inside, which name no argument."""
+"""Messages about internals, which name no argument."""
 BATCH = 400
-"""Calls of a child."""
+"""Number of calls per child process."""
 Arguments, Changes = dict[str, Any], dict[str, tuple[str, Any]]
 CPU_SECONDS, SECONDS, MEMORY = 60, 600.0, 2 << 30
-"""What a child may take; the machine may be busy."""
+"""Limits of a child process: CPU time [s], time [s], memory [bytes]. The time allows for a busy machine."""
 SUSPECTS = 20
-"""Calls before the end of a child that are made again alone."""
+"""Number of calls before the end of a crashed child that are repeated alone."""
 PUBLIC = 0.2
-"""Share of the calls that are of public functions."""
+"""Fraction of calls of public functions; the others are calls of ops."""
 FAULTS = ("crash", "time limit", "unclear")
 
 
 @dataclasses.dataclass(frozen=True)
 class Result:
-    """A call: which, what was done to which arguments, and how it ended."""
+    """A call: its name, the changes of its arguments, and its outcome."""
 
     number: int
     name: str
@@ -91,7 +91,7 @@ def names() -> list[str]:
 
 
 def malformed(seed: int, number: int, only: str | None = None) -> tuple[str, Callable[..., Any], Arguments, Changes]:
-    """(name, what to call, valid arguments, changes of some); the same for the same seed and number."""
+    """(name, callable, valid arguments, changes of some), determined by seed and number."""
     choose = random.Random(f"{seed} {number}")
     if only is None:
         only = choose.choice(sorted(public_calls() if choose.random() < PUBLIC else raw_calls()))
@@ -108,7 +108,7 @@ def malformed(seed: int, number: int, only: str | None = None) -> tuple[str, Cal
 
 
 def call(seed: int, number: int, only: str | None = None) -> Result:
-    """Makes a call. After an unclear error it is made again with each change alone, to name the argument at fault."""
+    """Outcome of a call. After an unclear error the call is repeated with each change alone, to find the argument."""
     name, *_, changes = malformed(seed, number, only)
     texts = {argument: text for argument, (text, _) in changes.items()}
     end, error = _end(seed, number, only, list(changes))
@@ -120,7 +120,7 @@ def call(seed: int, number: int, only: str | None = None) -> Result:
 
 
 def _end(seed: int, number: int, only: str | None, chosen: Sequence[str]) -> tuple[str, str]:
-    """How a call with the chosen changes ends, and its error."""
+    """Outcome of a call with the chosen changes, and its error."""
     name, function, arguments, changes = malformed(seed, number, only)
     arguments = arguments | {argument: changes[argument][1] for argument in chosen}
     try:
@@ -160,7 +160,7 @@ def child(seed: int, numbers: Iterable[int], only: str | None) -> int:
 
 
 def results(seed: int, numbers: Sequence[int], only: str | None = None) -> list[Result]:
-    """The results of calls in a child; after a crash the others go on in another one."""
+    """Results of calls in a child process; after a crash the remaining calls continue in another one."""
     outcome = _run(seed, numbers, only)
     found, started = [], None
     for line in outcome.text.splitlines():

@@ -1,4 +1,4 @@
-"""A case of a fuzz program as a child process of a warm one, and what its end means.
+"""Cases of fuzz programs as child processes of a warm process, and their outcomes.
 
 Import what the cases need first, then fork: a case then costs milliseconds. The parent must have one thread
 (OMP_NUM_THREADS=1, set before torch is imported), because a fork copies the thread that calls it alone.
@@ -35,7 +35,7 @@ TRACEBACK = "Traceback (most recent call last)"
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a case ended: "ok" or one of FAULTS, its exit status (negative: a signal), and all that it printed."""
+    """Outcome of a case: "ok" or one of FAULTS, exit status (negative: a signal), and printed text."""
 
     kind: str
     status: int
@@ -43,7 +43,7 @@ class Outcome:
 
 
 def run(work: Callable[[], int], *, must_fail: bool = False, seconds: float = 60.0, memory: int = 4 << 30) -> Outcome:
-    """Call ``work`` in a child process, which ends with the exit status that it returns.
+    """Call ``work`` in a child process whose exit status is its result.
 
     With ``must_fail``, exit status 0 is a fault. After ``seconds`` the child is killed. It may allocate ``memory``
     bytes beyond what it starts with.
@@ -119,12 +119,12 @@ class _Child:
         return bool(select.select([self._descriptor], [], [], seconds)[0])
 
     def cpu_seconds(self) -> float:
-        """CPU time of all its threads so far [s]."""
+        """CPU time of all threads of the child [s]."""
         fields = Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()
         return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
     def outcome(self, ended: bool, must_fail: bool = False) -> Outcome:
-        """How it ended. One that has not is killed."""
+        """Outcome of the child, which is killed if it is still running."""
         if not ended:
             os.kill(self.pid, signal.SIGKILL)
         _, status, usage = os.wait4(self.pid, 0)
@@ -145,7 +145,7 @@ def _kind(ended: bool, status: int, text: str, must_fail: bool) -> str:
 
 
 def _child(work: Callable[[], int], output: int, memory: int, begins: int) -> None:
-    """Does not return. It ends as any process does: what libraries do at exit belongs to the case.
+    """Does not return. The process exits normally: exit handlers of libraries are part of the case.
 
     Args:
         output: file for all that it prints.

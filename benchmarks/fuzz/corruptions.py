@@ -1,4 +1,4 @@
-"""Damage to the files of a run folder: by accident, and by somebody who knows how they are checked."""
+"""Damage to the files of a run folder: accidental, and forged with valid checksums."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def _fill(file: h5py.File, rng: random.Random) -> None:
 
 
 def _outside(file: h5py.File, rng: random.Random) -> None:
-    """Data of another file, as HDF5 can name them."""
+    """References to data of another file (external storage of HDF5)."""
     name = _array(file, rng)
     shape, dtype = file[name].shape, file[name].dtype
     _replace(file, name, shape=shape, dtype=dtype, external=[("/etc/passwd", 0, h5py.h5f.UNLIMITED)])
@@ -143,7 +143,7 @@ FORGERIES: dict[str, Callable[[h5py.File, random.Random], None]] = {
 
 
 def forge(path: Path, name: str, rng: random.Random) -> None:
-    """Change the HDF5 file and seal it again."""
+    """Change the HDF5 file and recompute its checksum."""
     data = path.read_bytes()
     length, _, _ = FOOTER.unpack(data[-FOOTER.size :])
     path.write_bytes(data[: -FOOTER.size - length])
@@ -159,7 +159,7 @@ def forge(path: Path, name: str, rng: random.Random) -> None:
 
 
 def corrupt(folder: Path, rng: random.Random) -> str:
-    """Damage one file of a run folder; says which and how."""
+    """Damage one file of a run folder; returns its name and the damage."""
     path = rng.choice(sorted(p for p in folder.iterdir() if p.is_file() and p.name != folders.LOCK))
     if path.suffix == ".h5" and rng.random() < 0.5:
         name = rng.choice(sorted(FORGERIES))

@@ -36,11 +36,11 @@ from . import command_lines, common, forged_shards, hostile_inputs, mutated_reco
 
 COLUMNS = ("crash", "traceback", "wrong exit status 0", "time limit", "unclear message", "written outside")
 MOST_LETTERS, MOST_LINES = 24_000, 60
-"""Of a message: more is not read."""
+"""Largest number of letters and lines of a message."""
 MANY_SUBSTEPS = 10**6
-"""Of a run that takes longer than the time limit, as it should."""
+"""Number of substeps from which a run may exceed the time limit."""
 UNCLEAR = re.compile(r"^torch-mpm: ?(['\"]?[\w.]*['\"]?)?$|Error\b.*object at 0x", re.MULTILINE)
-"""Messages that say nothing: none at all, or a single word."""
+"""Uninformative messages: none, a single word, or the address of an object."""
 SCENE = """
 device = "cpu"
 gravity = [0.0, -10.0]
@@ -136,7 +136,7 @@ class Fuzz:
         self.around = self._outside()
 
     def _warm(self) -> None:
-        """Import what the commands need: a child would do so in each case."""
+        """Import the modules that commands need, once for all children."""
         made = self.folder / "warm"
         for arguments in (
             ["stats", self.good / "set", "-o", made / "x.png"],
@@ -147,7 +147,7 @@ class Fuzz:
         shutil.rmtree(made)
 
     def _outside(self) -> dict[str, tuple[int, int]]:
-        """Sizes and times of all files that no command may change."""
+        """Sizes and times of all files that commands must not change."""
         places = [p for top in (self.good, self.here) for p in (top, *top.rglob("*"))] + list(self.folder.iterdir())
         return {str(p): (s.st_size, s.st_mtime_ns) for p in places if p != self.case and (s := p.lstat())}
 
@@ -161,7 +161,7 @@ class Fuzz:
             shutil.rmtree(self.case)
 
     def faults(self, arguments: Iterable[object], must_fail: bool = False, **limits: Any) -> Iterator[str]:
-        """Run a command in a child process; yields what is wrong with how it ends."""
+        """Run a command in a child process; yields the faults of its outcome."""
         words = [str(a) for a in arguments]
 
         def work() -> int:
@@ -184,7 +184,7 @@ class Fuzz:
         yield from found
 
     def _is_long(self, outcome: common.Outcome, words: list[str]) -> bool:
-        """Whether a run was ended for having more substeps than the time allows, which `check` counts for it."""
+        """Whether a run was killed for having more substeps than the time allows, as counted by `check`."""
         if outcome.kind != "time limit" or words[0] != "run":
             return False
         sets = [word for k, word in enumerate(words) if "--set" in words[max(0, k - 1) : k + 1]]
@@ -193,7 +193,7 @@ class Fuzz:
         return count is not None and float(count[1]) > MANY_SUBSTEPS
 
     def _false_success(self, words: list[str]) -> Iterator[str]:
-        """Exit status 0 of a command whose result is not there, or is none."""
+        """Fault: exit status 0 of a command without a valid result."""
         if words[0] == "run":
             with Trajectory(Path(words[words.index("-o") + 1])) as read:
                 if not (read.complete and all(np.isfinite(frame["position"]).all() for frame in read)):
@@ -253,7 +253,7 @@ class Fuzz:
                 yield from self._read_set(what, wrong, rng)
 
     def _read_set(self, what: str, wrong: bool, rng: random.Random) -> Iterator[str]:
-        """`verify`, which must see whatever is ``wrong``, and another command that reads the data set."""
+        """Faults of `verify`, which must fail if the data set is ``wrong``, and of another command that reads it."""
         folder = self.inputs / "set"
         found = list(self.faults(["verify", folder], wrong, memory=2 << 30))
         others: list[list[Any]] = [
@@ -270,7 +270,7 @@ class Fuzz:
         yield from found
 
     def limited(self, count: int, seed: int) -> Iterator[list[str]]:
-        """The faults of commands below limits of memory, in a process that has imported nothing but torch_mpm."""
+        """Faults of commands under memory limits, in a process that has imported torch_mpm only."""
         words = [sys.executable, "-m", "benchmarks.fuzz.memory_limits", str(self.folder), str(count), str(seed)]
         with subprocess.Popen(words, cwd=benchmark.ROOT, stdout=subprocess.PIPE, text=True) as process:
             assert process.stdout is not None
@@ -284,7 +284,7 @@ class Fuzz:
 
 
 def fuzz(folder: Path, counts: dict[str, int], seed: int) -> list[dict[str, Any]]:
-    """A row of counts for each part: ``counts`` says how many cases of each."""
+    """A row of counts for each part; ``counts`` is the number of cases of each."""
     program = Fuzz(folder)
     parts: dict[str, Callable[[random.Random], Iterator[str]]] = {
         "lines": program.line, "inputs": program.input, "configurations": program.configuration,

@@ -1,4 +1,4 @@
-"""Shards that somebody made who knows how they are checked: other contents, below records whose checksums fit."""
+"""Forged shards: changed contents with records of valid checksums."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ TEXTS: tuple[Any, ...] = (
 
 
 def forge(folder: Path, rng: random.Random) -> tuple[str, bool]:
-    """Change a shard of a data set; returns what was done, and whether `verify` must see it."""
+    """Change a shard of a data set; returns the change, and whether `verify` must detect it."""
     path = rng.choice(sorted((folder / "shards").glob("*.h5")))
     what = rng.choice(sorted(CHANGES))
     hidden = what in ("attributes", "text", "a foreign attribute", "measure")  # which have no checksum of their own
@@ -52,7 +52,7 @@ def forge(folder: Path, rng: random.Random) -> tuple[str, bool]:
 
 
 def _fit(path: Path, rehashed: bool) -> None:
-    """Make the record of a shard fit, with the hashes of its scenes where these can be computed."""
+    """Update the record of a shard, with the hashes of its scenes where these can be computed."""
     record = path.with_suffix(".json")
     words = json.loads(record.read_text())
     words.pop(CHECKSUM)
@@ -102,7 +102,7 @@ def _shape(file: Any, scene: Any, rng: random.Random) -> None:
 
 
 def _all_shapes(file: Any, scene: Any, rng: random.Random) -> None:
-    """Every array with one frame or particle less, which fit each other."""
+    """Remove one frame or particle from every array, consistently."""
     axis = rng.randrange(2)
     for name in list(scene):
         values = scene[name][...]

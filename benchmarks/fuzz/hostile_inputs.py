@@ -1,4 +1,4 @@
-"""Scenes with meshes and points that are damaged, endless, huge or no files at all."""
+"""Scenes with meshes and point files that are damaged, endless, huge, or not regular files."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ material = "jelly"
 
 
 def prepare(folder: Path) -> None:
-    """Good files, which the hostile ones are made of."""
+    """Valid files, from which the hostile ones are made."""
     (folder / "mesh.obj").write_text(_obj(CORNERS, FACES))
     (folder / "mesh.ply").write_text(_ply(CORNERS, FACES))
     (folder / "mesh.stl").write_bytes(_stl(CORNERS, FACES))
@@ -42,7 +42,7 @@ def prepare(folder: Path) -> None:
 
 
 def hostile(folder: Path, out: Path, rng: random.Random) -> tuple[list[str], str]:
-    """A command line with a scene of ``folder`` that names a hostile file, and what was done to the file."""
+    """A command line with a scene of ``folder`` that names a hostile file, and the change of the file."""
     name = rng.choice([p.name for p in sorted(folder.iterdir()) if p.name.startswith(("mesh.", "points."))])
     kind = name.partition(".")[0]
     damages = {**DAMAGES, **(MESHES if kind == "mesh" else POINTS)}
@@ -96,7 +96,7 @@ def _folder(path: Path, rng: random.Random) -> None:
 
 
 def _sparse(path: Path, rng: random.Random) -> None:
-    """A file of any size that takes no room on the disk."""
+    """A sparse file of a given size."""
     os.truncate(path, rng.choice((2**30, 2**33, 2**40)))
 
 
@@ -258,7 +258,7 @@ def _rows(path: Path, rng: random.Random) -> None:
 
 
 def _array(path: Path, rng: random.Random) -> None:
-    """NumPy files of other types and shapes, pickles and headers that lie."""
+    """NumPy files of other types and shapes, pickles, and wrong headers."""
     arrays = (
         np.array([{"a": 1}], dtype=object), np.zeros((2, 3), complex), np.zeros((2, 3), "S3"), np.zeros((2, 3), bool),
         np.zeros((2, 3), int), np.zeros((2, 3, 4)), np.float64(3), np.zeros((0, 3)), np.zeros((3, 0)),

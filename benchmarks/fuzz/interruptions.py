@@ -1,4 +1,4 @@
-"""Kills and signals at random moments: nothing is lost, nothing is left, and commands end soon.
+"""Kills and signals at random moments: no data is lost, no temporary file remains, and commands end soon.
 
     python -m benchmarks.fuzz.interruptions --kills 100 --signals 100 --seed 0
 
@@ -32,15 +32,15 @@ from .files import SCENE, SET
 
 COLUMNS = ("crash", "traceback", "wrong exit status", "late end", "files left", "lost or changed")
 FIGURES = ("still at work", "slowest end, s")
-"""Calls that had not ended before their signal, and the most CPU time to the end after it."""
+"""Number of calls that were still running at their signal, and largest CPU time from signal to end."""
 COMMANDS = ("run", "generate", "export", "render")
 SOON = 1.2
-"""CPU time that a command may use to end, its exit from Python included [s]."""
+"""Limit of the CPU time from signal to end, including the exit of Python [s]."""
 MOST = 120.0
-"""Time of any call [s]."""
+"""Time limit of a call [s]."""
 STATUS = {signal.SIGINT: 130, signal.SIGTERM: 143}
 EXISTS = "exists already; remove it"
-"""What an export says where it was complete."""
+"""Message of an export whose output is already complete."""
 STAMP = re.compile(rb"comment Created by meshio .*")
 """Line with the time in PLY files."""
 PICTURES = "render = {resolution = [160, 120]}\noutput.vtk = true\n"
@@ -106,7 +106,7 @@ class Interruptions:
         self.ends: list[float] = []  # times that calls have taken to end after signals
 
     def _call(self, words: list[str]) -> str:
-        """A call that nothing disturbs; returns what is wrong with it."""
+        """Make an undisturbed call; returns its faults."""
         outcome = common.run(lambda: cli.main(words), seconds=MOST)
         return "" if outcome.kind == "ok" and outcome.status == 0 else f"{words}: {outcome.kind}: {outcome.text}"
 
@@ -130,7 +130,7 @@ class Interruptions:
         return rng.choice((of_set, of_set, ["export", run, "-o", out, "--vtk"]))
 
     def _begin(self, words: list[str]) -> None:
-        """The folder as it is before a command."""
+        """Restore the folder to its state before a command."""
         shutil.rmtree(self.out, ignore_errors=True)
         if words == ["render", str(self.out)]:
             shutil.copytree(self.good / "run", self.out)
@@ -138,7 +138,7 @@ class Interruptions:
             (self.out / "video.mp4").unlink()
 
     def expected(self, words: list[str]) -> Path:
-        """The files of a call that nothing disturbs, made once."""
+        """Files of an undisturbed call, made once."""
         folder = self.whole / "".join(c if c.isalnum() else "_" for c in " ".join(words[:2] + words[4:]))
         if not folder.exists():
             self._begin(words)
@@ -150,7 +150,7 @@ class Interruptions:
         return folder
 
     def case(self, command: str, killed: bool, rng: random.Random) -> Iterator[str]:
-        """A call that is ended at a random moment, and one that completes what it was to make."""
+        """A call that is killed at a random moment, and a second call that completes its output."""
         if not killed and command in ("run", "generate") and rng.random() < 0.2:
             yield from self._long(command, rng)
             return
@@ -175,7 +175,7 @@ class Interruptions:
         yield from self._ended(words, rng.choice((signal.SIGINT, signal.SIGTERM)), rng.uniform(0.0, 4.0))
 
     def _ended(self, words: list[str], number: signal.Signals, delay: float) -> Iterator[str]:
-        """Send a signal to a call after some seconds; yields what is wrong with how it ends."""
+        """Send a signal to a call after some seconds; yields the faults of its outcome."""
         outcome, late = common.run_and_signal(lambda: cli.main(words), number, delay, MOST)
         self.ends += [late] if late else []
         found = [outcome.kind] if outcome.kind in ("crash", "traceback") else []

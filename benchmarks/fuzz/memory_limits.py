@@ -1,4 +1,4 @@
-"""Commands that may take less memory than they need, from those that cannot import a package to those that can.
+"""Commands under memory limits below their need, from failing imports to failing work.
 
     python -m benchmarks.fuzz.memory_limits FOLDER COUNT SEED
 
@@ -21,9 +21,9 @@ from torch_mpm import cli
 from . import common
 
 BLAME = re.compile(r"not installed|remove it|generate again|is damaged|is no |DamagedFile|unreadable")
-"""Words of messages that blame a file or an installation, in which nothing is wrong."""
+"""Words of messages that wrongly blame a file or an installation."""
 LEAST, MOST = 2**19, 2**31
-"""Limits beyond what the process has taken at its start [bytes]."""
+"""Limits above the memory of the process at its start [bytes]."""
 
 
 def commands(inputs: Path, out: Path) -> list[list[str]]:
@@ -42,7 +42,7 @@ def commands(inputs: Path, out: Path) -> list[list[str]]:
 
 
 def case(folder: Path, rng: random.Random) -> dict[str, object]:
-    """Run a command below a limit; returns the command, the limit and what was wrong with its end, "" for nothing."""
+    """Run a command below a limit; returns the command, the limit and the fault, "" without one."""
     out = folder / "limited"
     command = rng.choice(commands(folder / "good", out))
     memory = int(LEAST * (MOST / LEAST) ** rng.random())

@@ -29,14 +29,14 @@ from benchmarks.fuzz.common import run
 from torch_mpm.ops import LAWS
 
 REFUSALS = (TypeError, ValueError)
-"""Of public functions; ops raise a RuntimeError too."""
+"""Errors of public functions; ops may raise a RuntimeError too."""
 BATCH = 500
-"""Calls of a child."""
+"""Number of calls per child process."""
 FAULTS = ("accepted", "another error", "unnamed", "crash")
 
 
 class Stranger:
-    """Of no kind that a function may want."""
+    """Object of a type that no function accepts."""
 
 
 OTHERS: dict[str, Any] = {"None": None, "a word": "neo", "a dict": {}, "a stranger": Stranger(), "complex": 1j}
@@ -118,7 +118,7 @@ FITTING: tuple[tuple[str, str, str, str], ...] = (
 
 
 def misfits(value: Any) -> Iterator[tuple[str, Any]]:
-    """(what was done, a value of another kind) for an argument of a valid call."""
+    """(change, a value of another kind) for an argument of a valid call."""
     if isinstance(value, Tensor):
         yield from _of_tensor(value)
     elif isinstance(value, bool):
@@ -181,8 +181,8 @@ def names() -> list[str]:
 
 
 def changed(seed: int, number: int, only: str | None = None) -> tuple[str, Callable[[], Any], str, set[str], str]:
-    """(name, the call to make, argument, other names that may be in the message, what was done to the argument); the
-    same for the same seed and number."""
+    """(name, the call to make, argument, other names that may be in the message, change of the argument),
+    determined by seed and number."""
     choose = random.Random(f"misfit {seed} {number}")
     raw, faces = calls.raw_calls(), calls.public_calls()
     name = only or choose.choice(sorted(faces if choose.random() < 0.7 else raw))
@@ -207,7 +207,7 @@ def changed(seed: int, number: int, only: str | None = None) -> tuple[str, Calla
 
 
 def _compared(arguments: dict[str, Any], argument: str) -> set[str]:
-    """Names of what is compared with an argument, or of its parts: one of the two does not fit."""
+    """Names that an error may have instead of the argument: its parts, and arguments that it is compared with."""
     quantities = {q.name for law in LAWS.values() for q in (*law.parameters, *law.history)}
     if argument == "state" and "law" in arguments:
         return {"F", "J", "the state", *quantities, *arguments}
@@ -223,7 +223,7 @@ def _compared(arguments: dict[str, Any], argument: str) -> set[str]:
 
 
 def judged(seed: int, number: int, only: str | None = None) -> tuple[str, str, str, str, str]:
-    """(name, argument, what was done, how the call ended, its error)."""
+    """(name, argument, change, outcome of the call, its error)."""
     name, make, argument, others, done = changed(seed, number, only)
     try:
         make()
@@ -240,7 +240,7 @@ def judged(seed: int, number: int, only: str | None = None) -> tuple[str, str, s
 
 
 def _end(name: str, argument: str, others: set[str], done: str, error: Exception) -> str:
-    """How a call ended with an error; `others` are names that the message may have instead."""
+    """Outcome of a call with an error; `others` are names that the message may have instead."""
     allowed = (*REFUSALS, RuntimeError, NotImplementedError) if name.startswith("ops.") else REFUSALS
     if not isinstance(error, allowed) or not calls.is_clear(error):
         return "another error"
@@ -254,7 +254,7 @@ def _end(name: str, argument: str, others: set[str], done: str, error: Exception
 
 
 def fuzz(count: int, seed: int, only: str | None = None) -> list[list[Any]]:
-    """The calls in children: [number, name, argument, what was done, how it ended, its error]."""
+    """Calls in child processes: [number, name, argument, change, outcome, error]."""
     torch.set_num_threads(1)
     calls.raw_calls()  # before the fork, and so once
     found: list[list[Any]] = []

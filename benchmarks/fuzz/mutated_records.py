@@ -1,4 +1,4 @@
-"""Records of runs and data sets, JSON files, with mistakes; below checksums that fit, or those of before."""
+"""Records of runs and data sets (JSON files) with mistakes, with a valid or an old checksum."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ TEXTS = (
 
 
 def mutate(inputs: Path, rng: random.Random) -> tuple[str, bool]:
-    """Change a record; returns what was done, and whether the command that checks it must fail.
+    """Change a record; returns the change, and whether the command that checks it must fail.
 
     A record without a fitting checksum must be refused. One with a checksum that fits may be right by chance.
     """

@@ -1,4 +1,4 @@
-"""Malformed arguments: what may be done to one argument of a valid call."""
+"""Malformed arguments: changes of one argument of a valid call."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ NUMBERS = (math.nan, math.inf, -math.inf, 0.0, -1.0, -0.0, 1e-300, 1e-45, 1e300,
 
 
 def refuses(*_: Any, **__: Any) -> Any:
-    """A function of the caller's, whose own error no check can foresee."""
+    """A user function with an error of its own, which no check can foresee."""
     raise ValueError("refused")
 
 
 def nothing(_: Any) -> None:
-    """A function of the caller's that returns what none should."""
+    """A user function without a result."""
 
 
 class Refuses:
-    """A class, of which `refuses` is true too."""
+    """A user class whose constructor fails as `refuses` does."""
 
     def __init__(self, *_: Any, **__: Any) -> None:
         refuses()
@@ -41,7 +41,7 @@ FIXED_CONTENTS = ("topology",)
 
 
 def mutate(name: str, value: Any, others: list[Any], choose: random.Random) -> tuple[str, Any]:
-    """(what was done, another value) for an argument of a call with the arguments `others`."""
+    """(change, another value) for an argument of a call with the arguments `others`."""
     kind = choose.random()
     if kind < 0.12:
         other = choose.choice(STRANGERS)
@@ -97,7 +97,7 @@ def _tensor(value: Tensor, contents: bool, choose: random.Random) -> tuple[str, 
 
 
 def _resized(change: int) -> Callable[[Tensor, int], Tensor]:
-    """With one row more or fewer, repeated from the front."""
+    """Tensor with one row more, repeated from the front, or one fewer."""
 
     def resize(t: Tensor, axis: int) -> Tensor:
         rows = torch.arange(max(t.shape[axis] + change, 0)) % max(t.shape[axis], 1)
@@ -107,7 +107,7 @@ def _resized(change: int) -> Callable[[Tensor, int], Tensor]:
 
 
 def _huge(t: Tensor, axis: int) -> Tensor:
-    """2^40 rows in the memory of one."""
+    """Tensor of 2^40 rows that share the memory of one."""
     shape = list(t.shape)
     shape[axis] = 2**40
     return t.narrow(axis, 0, 1).expand(shape)

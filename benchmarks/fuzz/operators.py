@@ -41,7 +41,7 @@ def calls(dim: int, dtype: torch.dtype = torch.float64) -> list[tuple[str, dict[
 
 def _named(op: str, values: tuple[Any, ...]) -> dict[str, Any]:
     names = [a.name for a in getattr(torch.ops.torch_mpm, op).default._schema.arguments]
-    return dict(zip(names, values, strict=False))  # those left out have defaults
+    return dict(zip(names, values, strict=False))  # missing ones have defaults
 
 
 class _Calls:
@@ -213,7 +213,7 @@ class _Calls:
         ]
 
     def rollouts(self) -> list[tuple[str, tuple[Any, ...]]]:
-        """Three laws, of which one has a history and one reads J and C."""
+        """Calls with three laws: one with a history, one that reads J and C."""
         P, D, ones = PARTICLES, self.dim, torch.ones((), dtype=self.dtype)
         material, ids = torch.arange(P, dtype=torch.int32) % 3, torch.arange(P)
         fields = (self.x, self.normal(P, D), 1 + self.uniform(P), self.uniform(P), self.normal(P, D, D), self.F)

@@ -20,7 +20,7 @@ POINTS = 16
 
 
 class _World:
-    """Small objects that calls share, new for each call: a call may change them."""
+    """Small objects for the arguments of calls, made anew for each call, which may change them."""
 
     def __init__(self) -> None:
         self.grid = mpm.Grid(0.25, (0.0, 0.0), (1.0, 1.0), max_blocks=9)
@@ -48,17 +48,17 @@ class _World:
 
 
 def calls() -> dict[str, Callable[[], Call]]:
-    """By name: a function that makes (what to call, arguments by name)."""
+    """By name: a function that makes (callable, arguments by name)."""
     single = {**_grids_and_states(), **_steps(), **_laws(), **_boundaries(), **_heat(), **_seed(), **_ops()}
     return {**single, **_rollouts(), **_particles(), **_batches()}
 
 
 LARGEST = 32
-"""Of a number of steps, rows or scenes."""
+"""Largest number of steps, rows or scenes."""
 
 
 def _limited(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A function that refuses numbers for which it would take longer than this program has."""
+    """A function that refuses numbers beyond the time limit of this program."""
 
     def called(**arguments: Any) -> Any:
         for name in ("n", "most", "room", "scenes", "blocks"):
@@ -72,7 +72,7 @@ def _limited(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def _rollouts() -> dict[str, Callable[[], Call]]:
     def taken(function: Callable[..., Any], /, **given: Any) -> Callable[[], Call]:
-        """With a step of a batch and its state, as far as the function takes them."""
+        """Call with a step of a batch and its state, if they are arguments of the function."""
 
         def make() -> Call:
             w = _World()
@@ -128,7 +128,7 @@ def _rollouts() -> dict[str, Callable[[], Call]]:
 
 
 def _particles() -> dict[str, Callable[[], Call]]:
-    """What acts on particles, and what joins and parts states."""
+    """Operations on particles, and functions that join and split states."""
 
     def acting(kind: Callable[..., Any], /, **given: Any) -> Callable[[], Call]:
         def use(**arguments: Any) -> Any:
@@ -363,7 +363,7 @@ def _steps() -> dict[str, Callable[[], Call]]:
 
 def _laws() -> dict[str, Callable[[], Call]]:
     def applied(law: Callable[..., mpm.Material], /, **given: Any) -> Callable[[], Call]:
-        """Made and used."""
+        """Construct and call."""
 
         def use(**arguments: Any) -> Any:
             state = _World().state.replace(extra={name: torch.ones(POINTS) for name in law.extra_fields})
@@ -413,7 +413,7 @@ def _laws() -> dict[str, Callable[[], Call]]:
 
 def _boundaries() -> dict[str, Callable[[], Call]]:
     def applied(obstacle: Callable[..., Any], /, **given: Any) -> Callable[[], Call]:
-        """Made and used in a step."""
+        """Construct and use in a step."""
 
         def use(**arguments: Any) -> Any:
             w = _World()

@@ -1,4 +1,4 @@
-"""Runs under everything that goes wrong around them: mutated scene files, kills, full disks, damaged run folders.
+"""Runs under external faults: mutated scene files, kills, full disks, damaged run folders.
 
     python -m benchmarks.fuzz.runs --mutations 1000 --kills 100 --disks 100 --corrupt 100 --seed 0
 
@@ -76,7 +76,7 @@ class Fuzz:
         common.run(lambda: at_frame(HALF, lambda: os.kill(os.getpid(), signal.SIGKILL), self._resume(self.half)))
 
     def _warm(self) -> None:
-        """A run and its pictures and exports, which damaged runs are compared with; a scene of each kind."""
+        """Reference run with pictures and exports, for comparison with damaged runs; a scene of each kind."""
         good = self.folder / "good"
         self._succeed("run", self.scene, "-o", good, "--quiet")
         self._succeed("export", good, "--ply")
@@ -87,7 +87,7 @@ class Fuzz:
             self._succeed("check", path)
 
     def _succeed(self, *arguments: object) -> None:
-        """In this process, so that the children find everything imported and initialised."""
+        """Import and initialise in this process, once for all children."""
         with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
             status = cli.main([str(a) for a in arguments])
         if status:
@@ -97,7 +97,7 @@ class Fuzz:
         return lambda: cli.main(["run", str(self.scene), "-o", str(out), "--quiet", "--resume"])
 
     def _lost(self) -> int:
-        """Frames of the run in ``out`` that are missing or are not those of the run left in peace."""
+        """Frames of the run in ``out`` that are missing or differ from those of the reference run."""
         try:
             with Trajectory(self.out) as read:
                 same = [
@@ -111,7 +111,7 @@ class Fuzz:
         return len(self.frames["time"]) - sum(same) * statics
 
     def _finished(self) -> Iterator[str]:
-        """Go on with the run in ``out``, which must end with every frame."""
+        """Resume the run in ``out``, which must end with all frames."""
         outcome = common.run(self._resume(self.out))
         if outcome.status and "complete run" not in outcome.text:
             yield "traceback" if outcome.kind == "ok" else outcome.kind
@@ -184,12 +184,12 @@ class Fuzz:
 
 
 def undated(path: Path) -> bytes:
-    """A file without the comment of PLY files that tells when it was written."""
+    """Content of a file without the date comment of PLY files."""
     return re.sub(rb"comment Created by .*\n", b"", path.read_bytes(), count=1)
 
 
 def at_frame(frame: int, action: Callable[[], Any], work: Callable[[], int]) -> int:
-    """Do ``work``, and ``action`` when it hands over a frame. Only for a child process, which it leaves changed."""
+    """Do ``work``, and ``action`` at the end of a frame. For child processes only, since it patches modules."""
     submit = writer.FrameWriter.submit
 
     def and_act(self: Any, handed: writer.Frame) -> None:
@@ -202,7 +202,7 @@ def at_frame(frame: int, action: Callable[[], Any], work: Callable[[], int]) -> 
 
 
 def fuzz(folder: Path, counts: dict[str, int], seed: int) -> list[dict[str, Any]]:
-    """A row of counts for each part: ``counts`` says how many cases of each."""
+    """A row of counts for each part; ``counts`` is the number of cases of each."""
     program = Fuzz(folder)
     parts = {"mutations": program.mutation, "kills": program.kill, "disks": program.disk, "corrupt": program.corruption}
     rows = []

@@ -54,7 +54,7 @@ NASTY: list[Any] = [
 
 
 def prepare(folder: Path) -> None:
-    """The files that the scenes name."""
+    """Files named by the scenes."""
     np.save(folder / "points.npy", np.array([[0.8, 0.2], [0.85, 0.2]]))
     corners = ["v 0 0 0", "v 1 0 0", "v 0 1 0", "v 0 0 1"]
     faces = ["f 1 3 2", "f 1 2 4", "f 2 3 4", "f 1 4 3"]
@@ -72,8 +72,8 @@ def mutated(rng: random.Random) -> tuple[str, bool]:
 
 
 def mistakes(words: dict[str, Any], values: list[Any], rng: random.Random) -> bool:
-    """Make one to three mistakes in the words of a file, with values among others; return whether one of them is an
-    unknown key, so that the file must be refused."""
+    """Make one to three mistakes in the words of a file; return whether one of them is an unknown key, so that the file
+    must be refused."""
     wrong = False
     for _ in range(rng.randint(1, 3)):
         holder, key = rng.choice(list(_places(words)))

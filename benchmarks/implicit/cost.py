@@ -1,4 +1,4 @@
-"""What the parts of an implicit step cost.
+"""Costs of the parts of an implicit step.
 
 A product of the Hessian, an iteration of conjugate gradients and the node blocks, beside a gather and a scatter of D
 channels with their moments; whole steps of a cube of rubber that lands on its face, many times as long as explicit ones

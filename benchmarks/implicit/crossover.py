@@ -1,10 +1,10 @@
-"""What explicit and implicit steps of slow motion cost by the size of the body, for `Step.explain`.
+"""Costs of explicit and implicit steps of slow motion by the size of the body, for `Step.explain`.
 
 The gripper of the quasi-static study in 2-D, and a cube in its place in 3-D, with E = 1e8 Pa and plates of 1 cm/s, in
 float32, on CPUs on one thread; P particles. Implicit steps are those in which a plate moves by 5% of a cell. Least
 squares of relative errors: an explicit step takes a + b P, an implicit one A + B P; iterations of conjugate gradients
-grow little with the size. "faster": time of explicit steps for the same motion over that of implicit ones; "says": what
-`torch_mpm.implicit.compare` says.
+grow little with the size. "faster": time of explicit steps for the same motion over that of implicit ones; "says": the
+result of `torch_mpm.implicit.compare`.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ length on the same lattice, "in all" against explicit steps on a lattice twice a
 where the coarse ones are; the latter is mostly the gap of about half a cell at a plate. "faster": time of the explicit
 run of the same type over that of the row. Times are those of the processor, on one thread, so that other programs of
 the machine count little; the least of two where it is below 5 s. At equal error: the fastest implicit run whose error
-in time is at most half of what is the error in all of explicit steps, and the fastest with 1%.
+in time is at most half the error in all of explicit steps, and the fastest with 1%.
 
 Settling: the same block on a sticky floor, weight switched on at once; until its displacement stays within 1% of the
 static equilibrium on the same lattice for a period of its slowest vibration (4 H/c). Implicit steps are as long as

@@ -72,7 +72,7 @@ def rows(cells: Sequence[int], device: str, samples: int, backend: str) -> Itera
     ways: dict[str, Callable[[], Advance]] = {"step by step": lambda: eager(step)}
     ways[f"torch.compile, {backend}"] = lambda: eager(_compiled(step, backend))
     if device == "cuda":
-        ways["captured"] = lambda: mpm.captured(step, state, DT, STEPS)
+        ways["captured"] = lambda: mpm.make_graphed_step(step, state, DT, STEPS)
         ways["rollout(graph=4)"] = lambda: lambda state: mpm.rollout(step, state, STEPS, DT, graph=STEPS // 2)
     reference = gradients(eager(step), step, state)
     for name, make in ways.items():

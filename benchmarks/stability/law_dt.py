@@ -71,7 +71,7 @@ def text(result: dict[str, Any]) -> str:
         "",
         "The largest stable time step in multiples of the estimate `step.stable_dt(state, cfl=1)`: the lower end of a",
         f"bracket 3% wide. The smallest of {len(limited)} cases is {min(limited):.2f}; {len(cases) - len(limited)}",
-        "more (in brackets) are not elliptic, so that disturbances grow whatever the step; with – they did. Of the",
+        "more (in brackets) are not elliptic, so that disturbances grow for every step; with – they did. Of the",
         f"values of E from 1e3 to 1e9 Pa the smallest; they differ by at most {spread(cases):.2g}. s < 1 is F = s I,",
         "s > 1 is F = diag(s, ...) with det F = 1.",
         "",

@@ -203,7 +203,7 @@ def text(result: dict[str, Any]) -> str:
         "",
         "The largest stable time step in multiples of the estimate `step.stable_dt(state, cfl=1)`: the lower end of a",
         f"bracket 3% wide. The smallest of {len(limited)} cases is {min(limited):.2f}. {hopeless} cases are unstable",
-        "whatever the step (–): the grid does not see all motions of their particles, and prestress feeds those. One",
+        "for every step (–): the grid does not resolve all motions of their particles, and prestress feeds those. One",
         f"particle per cell under compression ({len(buckling)} cases, apart) buckles in this way; PIC damps that per",
         "step, which leaves a limit that is not one of waves.",
         "",

@@ -1,4 +1,4 @@
-"""The benchmark of implicit steps runs, and what it finds is what the documentation says."""
+"""The benchmark of implicit steps runs, and its results are those of the documentation."""
 
 import pytest
 from helpers import result, run_quick

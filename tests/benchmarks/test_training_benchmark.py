@@ -43,7 +43,7 @@ def test_scripts_do_the_physics_of_the_rollout(key: str, name: str, checkpoints:
 
 
 def test_stress_moves_the_particles_of_the_peer() -> None:
-    """With another modulus they are elsewhere, so that the agreement says something of the law."""
+    """With another modulus the positions differ, so the agreement is evidence for the law."""
     s = strained("MPM-PyTorch", "cpu")[1]
     stiff = training.with_room(s, mpm.FixedCorotated(mu=1.1 * work.MU, lam=work.LAM), stress_form="gradient")
     found, other = (training.rolled(setup, 20)(s.state.v)[0] - s.state.x for setup in (s, stiff))
@@ -62,7 +62,7 @@ def test_what_does_not_fit_is_a_row_without_a_time(monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.skipif(not memory.Resident.available, reason="/proc/self/clear_refs cannot be written to")
 def test_resident_memory_of_a_case_is_that_of_its_tensors() -> None:
-    """Tensors that ops return, counted here, against what the system says of another process."""
+    """Tensors that ops return, counted here, against the memory that the system reports for another process."""
     case = training.Case("its algorithm", "all steps", 12, 4, project="MPM-PyTorch")
     program = case.program("cpu")
     counted = memory.of_returned_tensors(lambda: training.both(*program))

@@ -338,7 +338,7 @@ def test_impulses_are_the_change_of_momentum(dim, device):
 
 
 def test_scenes_move_at_their_own_speed(device):
-    """And a scene that was reset has its obstacle where the attributes say, which pushes nothing on its way there."""
+    """The obstacle of a scene that was reset is at the pose of its attributes, and pushes nothing on its way there."""
     speeds = torch.tensor([0.0, 0.5, 1.0], dtype=F64, device=device)
     home = start(device=device).repeat(3, 1)
     paddle = box(home)
@@ -397,7 +397,7 @@ def test_transforms_and_compiled_steps(device):
 
 @pytest.mark.parametrize("form", ["[B]", "[1]", "[]"])
 def test_a_time_step_of_each_scene(form, device):
-    """A paused scene has its obstacle wait, and go on to its pose later."""
+    """The obstacle of a paused scene waits, and continues to its pose later."""
     scenes = 2 if form == "[B]" else 1
     values = {"[B]": [DT, 0.5 * DT], "[1]": [0.5 * DT], "[]": 0.5 * DT}[form]
     dt = torch.tensor(values, dtype=F64, device=device)

@@ -99,7 +99,7 @@ STEEP = {
 
 @pytest.mark.parametrize("name", STEEP)
 def test_no_node_inside_is_missed_by_the_test_of_blocks(name, dim, device):
-    """Blocks are left out by their distance; within a cell the slope may reach √D."""
+    """Blocks are skipped by their distance; within a cell the slope may reach √D."""
     grid = mpm.Grid(dx=0.02, lower=(0.0,) * dim, upper=(1.0,) * dim)
     blocks = grid.activate(mpm.seed.box((0.3,) * dim, (0.7,) * dim, grid, 1, dtype=torch.float64, device=device).x)
     positions = blocks.node_positions(torch.float64)
@@ -161,7 +161,7 @@ def test_bad_samples():
 
 
 def test_numbers_that_are_no_samples_touch_nothing(device):
-    """The raw op, whose data the device alone could look at."""
+    """The raw op, whose data only the device can read."""
     blocks, _, velocity = nodes(2, device)
     table = torch.zeros(1, 1, 10, dtype=torch.float64, device=device)
     for numbers in ([0.0, 0.0], [0.0, 0.0, 1.0, 1e9, 1e9, -1.0], [0.0, 0.0, 1.0, float("nan"), 2.0, -1.0]):

@@ -123,7 +123,7 @@ def dense_increment(h: Heat, boundaries: bool = True) -> Tensor:
 
 
 def check_replay(h: Heat) -> None:
-    """A solve that a CUDA graph replays is the solve of what is then in its inputs."""
+    """A solve that a CUDA graph replays is that of the current contents of its inputs."""
     h.solve(tolerance=1e-6)
     torch.cuda.synchronize()
     graph = torch.cuda.CUDAGraph()

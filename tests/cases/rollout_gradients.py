@@ -19,7 +19,7 @@ Rollout = Callable[[mpm.Step, mpm.State], mpm.State]
 
 def in_op(every: int | mpm.Checkpoints | None = None, n: int = STEPS, dt: float = DT) -> Rollout:
     def run(step: mpm.Step, state: mpm.State) -> mpm.State:
-        assert step.explain(state, dt).startswith("all steps between two kept states in one op")
+        assert step.explain(state, dt).startswith("all steps between two stored states in one op")
         return mpm.rollout(step, state, n, dt, checkpoint=every)
 
     return run

@@ -1,4 +1,4 @@
-"""Keys, materials and values that the other interfaces do not know or cannot have are errors by name."""
+"""Unknown or impossible keys, materials and values of the other interfaces are errors by name."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""Recordings: frames arrive in the arrays of their scenes, and packed, by whatever threads; errors reach the caller."""
+"""Recordings: frames arrive in the arrays of their scenes, and packed, by any number of threads; errors are raised."""
 
 import threading
 from concurrent.futures import ThreadPoolExecutor

@@ -134,7 +134,7 @@ def test_missing_things(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("reads", ["arrays", "frames", "ply", "vtk"])
 def test_flipped_bits_are_not_read(tmp_path, layout, reads):
-    """Whatever is read is what was written, or an error: metadata, arrays, numbers of frames, checksums."""
+    """A read returns the written values, or raises: metadata, arrays, numbers of frames, checksums."""
     layout = dataclasses.replace(layout, attributes={"title": "test", "seed": 3})
     create(tmp_path / PARTIAL, layout)
     writer = TrajectoryWriter(tmp_path / PARTIAL)

@@ -43,7 +43,7 @@ def test_pic_does_not_converge_and_the_hybrid_does_not_care_for_small_steps():
 
 @pytest.mark.parametrize("transfer", ["hybrid", "apic", "flip", "pic"])
 def test_heat_is_conserved(device, dim, kernel, transfer):
-    """Random particles, conductivities and temperatures: heat stays to rounding, whatever each particle's weight."""
+    """Random particles, conductivities and temperatures: heat is conserved to rounding, for any weights."""
     for dtype, limit in ((torch.float64, 1e-13), (torch.float32, 1e-6)):
         state = block(dim, device, dtype, n=4, jitter=0.4)
         kappa = 10 ** (6 * random_like(state.mass) - 4)

@@ -147,7 +147,7 @@ def test_constrained_bar(dim):
 
 
 def test_bar_between_walls_is_under_pressure_and_a_free_one_is_not():
-    """The same in a rollout: 2-D, ν = 0, so that the stress along the bar is −E α ΔT whatever the bar does across."""
+    """The same in a rollout: 2-D, ν = 0, so that the stress along the bar is −E α ΔT for any motion across it."""
     E, alpha, rise = 1e5, 1e-4, 50.0
     law = mpm.ThermalExpansion(mpm.NeoHookean(E=E, nu=0.0), alpha)
     bar = mpm.State.at_rest(mpm.seed.box((0, 0.4), (1, 0.6), 0.1, per_cell=4), 1000.0, dtype=torch.float64)

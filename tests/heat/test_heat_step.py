@@ -38,7 +38,7 @@ def test_no_jump_makes_a_step_grow(case, transfer):
 
 
 def test_table_of_the_benchmark():
-    """Its quick form has every variant, and its tables say what the cases do."""
+    """Its quick form has every variant, and its tables have the results of the cases."""
     chosen = list(heat_step.cases(quick=True))
     variants = {(case.jump, case.at, case.boundary) for case in chosen}
     assert len(variants) == 12 and {case.transfer for case in chosen} == set(TRANSFERS)
@@ -238,7 +238,7 @@ def test_paused_scene_with_plastic_heating(device):
 
 @pytest.mark.parametrize("method", ["cg", "multigrid"])
 def test_solve_of_a_paused_scene_has_gradients(method):
-    """`heat_cg` alone: the increment of a scene with dt = 0 is zero whatever its data."""
+    """`heat_cg` alone: the increment of a scene with dt = 0 is zero for any data."""
     _, both, dt = paused_batch()
     grid = grid_around(n=4, scenes=2)
     blocks = grid.activate(both.x, both.scene)

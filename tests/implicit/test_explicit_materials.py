@@ -102,7 +102,7 @@ def test_thick_and_plastic_explicit_materials(plasticity, device):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_momentum_in_free_flight(dim, dtype, device):
-    """To rounding, whatever the tolerance; steps are far beyond the limit of the solid."""
+    """To rounding, for any tolerance; steps are far beyond the limit of the solid."""
     grid, state = beside(dim, device, dtype)
     step = mpm.Step(grid, mixture(E=1e8), integrator=Implicit(1e-3, explicit=[FLUID]))
     explicit = mpm.Step(grid, mixture(E=1e8))

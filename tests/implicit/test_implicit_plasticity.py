@@ -54,7 +54,7 @@ def sheared(state):
 @pytest.mark.parametrize("name", LAWS)
 def test_tangent_of_a_flow(name, dim, device):
     """Against differences of the stress, as a bilinear form: all of it where the flow is associated, otherwise the
-    symmetric part. Particles beside a corner of the yield surface, where differences mix branches, are left out."""
+    symmetric part. Particles beside a corner of the yield surface, where differences mix branches, are excluded."""
     grid, state = body(dim, device, per_cell=16 if dim == 2 else 8)
     law = LAWS[name]
     state = mpm.Step(grid, law).prepare(sheared(state))
@@ -218,7 +218,7 @@ def test_scenes_are_solved_as_alone(device):
 
 @pytest.mark.parametrize("flows", [False, True])
 def test_residual_in_float32(flows, dim, device):
-    """Against float64: some units in the last place of what is added up: momenta, stresses of strains of one."""
+    """Against float64: some units in the last place of the summands: momenta, stresses of strains of one."""
     law, dt, residuals = LAWS["von_mises"], 1e-3, []
     for dtype in (torch.float64, torch.float32):
         grid, state = body(dim, device, torch.float64)

@@ -1,4 +1,4 @@
-"""The line search of Newton's method, and how often the host looks at the device."""
+"""The line search of Newton's method, and the number of waits for the device."""
 
 import pytest
 import torch

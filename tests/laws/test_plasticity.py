@@ -895,7 +895,7 @@ def test_custom_law_of_stretches_is_the_compiled_one(device, dim):
 
 
 def test_custom_plastic_law_of_stretches(device, dim):
-    """A clamp with the stress of what it leaves: its gradients are those of the compiled snow."""
+    """A clamp with the stress of the clamped strain: its gradients are those of the compiled snow."""
     snow = mpm.Snow(mu=2.0, lam=3.0, critical_compression=0.05, critical_stretch=0.05, hardening=0.0)
 
     def clamp(sigma: Tensor) -> tuple[Tensor, Tensor]:

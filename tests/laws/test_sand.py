@@ -239,7 +239,7 @@ def test_mobilised_friction(device, energy, flow, plane_strain):
 
 
 def test_exact_flow_is_along_the_stress(device):
-    """h_trial − h is a positive multiple of dev τ, and the radial map differs by what the notes of the model say."""
+    """h_trial − h is a positive multiple of dev τ, and the radial map differs as in the notes of the model."""
     F, mu, lam, angle = (t.to(device) for t in random_states(2000, 3))
     for energy in ("full", "unilateral"):
         result = quartic_return_map(F, mu, lam, angle, energy=energy, flow="exact")
@@ -664,7 +664,7 @@ def test_gradient_at_the_identity(device, dim):
     [("full", "radial"), ("unilateral", "radial"), ("hencky", "radial"), ("full", "exact"), ("unilateral", "exact")],
 )
 def test_gradients_in_float32_at_nearly_equal_stretches(device, energy, flow, mean, gap):
-    """On the cone, with two stretches that differ by `gap`: below 1e-6, whatever a rounding of F would change."""
+    """On the cone, with two stretches that differ by `gap`: below 1e-6, the change by a rounding of F."""
     count = 500
     h = mean * torch.tensor([[3.0, 3.0, -3.0]], dtype=torch.float64).repeat(count, 1)
     h[:, 1] -= gap

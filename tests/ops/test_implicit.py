@@ -263,7 +263,7 @@ def test_iterations_end_at_their_limit(most, device):
 
 
 def test_the_solution_stays_in_the_range_of_the_preconditioner(dim, device):
-    """Nodes that are held, and others that may slide along one axis: the residual of what is free vanishes."""
+    """Nodes that are held, and others that may slide along one axis: the residual of the free components vanishes."""
     case = Case(dim, "quadratic", device)
     p, rhs = case.particles, case.nodes(4) * case.mass[:, None]
     free = torch.ones_like(rhs)
@@ -281,7 +281,7 @@ def test_the_solution_stays_in_the_range_of_the_preconditioner(dim, device):
 
 
 def test_nodes_are_held_along_any_direction(dim, device):
-    """Against a dense solve of what is free; what holds the nodes is not in the way of a tight tolerance."""
+    """Against a dense solve of the free components; constraints do not limit the tolerance."""
     for dtype, least in ((torch.float64, 1e-12), (torch.float32, 3e-6)):
         case = Case(dim, "quadratic", device, dtype)
         normal = (

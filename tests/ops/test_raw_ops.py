@@ -109,8 +109,8 @@ def test_the_lattice() -> None:
 
 
 def test_expected_and_given_shapes_are_told() -> None:
-    """One row fewer in each particle or node tensor: the message says which, what was expected, and what came. Of
-    images, and of particles that are taken, there may be any number."""
+    """One row fewer in each particle or node tensor: the message has its name, the expected and the given shape.
+    Images, and particles to take, may have any number."""
 
     def changes(arguments: Arguments) -> Iterator[tuple[Arguments, str]]:
         for name, value in arguments.items():

@@ -1,4 +1,4 @@
-"""The CPU transfers: threads, instruction sets, order and strides of the particles, particles left out."""
+"""The CPU transfers: threads, instruction sets, order and strides of the particles, skipped particles."""
 
 import os
 import subprocess

@@ -1,4 +1,4 @@
-"""Pictures: things appear where projection says, in the colour the scale says; files are whole or absent."""
+"""Pictures: objects appear at their projection, in the colour of the scale; files are complete or absent."""
 
 from __future__ import annotations
 

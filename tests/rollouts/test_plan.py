@@ -217,7 +217,7 @@ def test_plans_of_rollouts_with_gradients(device):
     state = state.replace(v=state.v.requires_grad_())
     plan = mpm.plan_rollout(step, state, 20, DT, checkpoint=5)
     assert (plan.steps_per_call, plan.checkpoints) == (5, mpm.Checkpoints(every=5))
-    assert str(plan).startswith("all steps between two kept states in one op (executor fused, schedule ")
+    assert str(plan).startswith("all steps between two stored states in one op (executor fused, schedule ")
     whole = mpm.plan_rollout(step, state, 20, DT, checkpoint=mpm.Checkpoints(memory=1e9))
     assert whole.stores_all and whole.schedule == "per_step"
     ends = [mpm.rollout(step, state, 20, DT, plan=p).x for p in (plan, whole)]

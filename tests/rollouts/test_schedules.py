@@ -15,7 +15,7 @@ LAWS = {name: LAWS_HERE[name] for name in ("neo_hookean", "fluid", "von_mises", 
 
 
 def serves(schedule: str, device: str, law: str, transfer: str, walls: str) -> bool:
-    """What each schedule is for."""
+    """The case that each schedule serves."""
     if schedule in ("per_step", "sorted_cpu"):
         return schedule == "per_step" or device == "cpu"
     if device == "cpu" or law == "mixture" or walls == "mirror" or "flip" in transfer:

@@ -1,4 +1,4 @@
-"""Scene files with heat: what they say, what comes out, and what they may not say."""
+"""Scene files with heat: their meaning, their results, and refused contents."""
 
 import math
 import signal

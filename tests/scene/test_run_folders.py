@@ -220,7 +220,7 @@ def test_a_forged_checkpoint_is_refused(scene, unfinished, capsys, change, messa
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (fill("frames_written", 10**6), "says that 1000000 of its 5 frames are written"),
+        (fill("frames_written", 10**6), "states that 1000000 of its 5 frames are written"),
         (fill("material", 9), "material has a number that stands for nothing"),
         (fill("mass", -1.0), "mass has a number that is not positive"),
         (exchange("velocity", external), "'velocity' is not stored as a plain array in the file"),

@@ -1,4 +1,4 @@
-"""Sand as it should behave: at rest, on slopes, in a collapse, in batches; and what scene files say about it."""
+"""Sand as it should behave: at rest, on slopes, in a collapse, in batches; and its scene files."""
 
 import math
 

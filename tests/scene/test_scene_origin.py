@@ -123,7 +123,7 @@ def test_files_in_coordinates_of_a_map(kind, tmp_path):
 
 
 def test_a_scene_on_a_map_without_an_origin_is_refused(tmp_path, capsys):
-    """And says what to do; also from the command line."""
+    """The message has the remedy; also from the command line."""
     scene = words(UTM, 2)
     with pytest.raises(SceneError, match=r"grid: coordinates up to 5e\+06 m .* float32.*`origin`.*float64"):
         Scene(**scene).build()

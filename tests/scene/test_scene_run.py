@@ -1,4 +1,4 @@
-"""Runs of scenes: the physics of what comes out, and that nothing is lost or half-written whatever happens."""
+"""Runs of scenes: the physics of their results; no data is lost or half-written, errors and signals included."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""Scene files: what they say is understood, and what is wrong is named with the key and what it takes."""
+"""Scene files: valid ones are read, and errors name the key and the values that it takes."""
 
 # ruff: noqa: E501
 

@@ -41,7 +41,7 @@ OTHERS = {
 
 
 def state_of(F, device, history=None, **fields):
-    """Particles with a deformation; everything else a law may look at is there too."""
+    """Particles with a deformation and all other fields that a law may read."""
     F = F.to(device)
     P, D = F.shape[:2]
     x = torch.full((P, D), 0.5, dtype=F.dtype, device=device)

@@ -1,8 +1,8 @@
-"""What acts on the velocity of the grid nodes: the walls of the domain, and obstacles that may move.
+"""Boundaries, which change the velocity of grid nodes: the walls of the domain, and obstacles that may move.
 
-An `nn.Module` with the arguments below, or any object with a method `apply` that takes them, can stand in the list of
-boundaries of a `Step`. It is ordinary torch code on the nodes, so gradients come by themselves; this one blows through
-the upper half of the domain:
+The list of boundaries of a `Step` may contain any `nn.Module` with the arguments below, or any object with a method
+`apply` of these arguments. It is ordinary torch code on the nodes, differentiated by autograd. This one accelerates the
+upper half of the domain:
 
     class Wind(torch.nn.Module):
         def __init__(self, acceleration):  # [D]

@@ -41,9 +41,9 @@ class Left(NamedTuple):
         given: the attributes of the obstacle, in a form that shows whether they have changed.
         placements: how often it was placed.
         values: the attributes then, which later writes do not change; and `start` and `end`.
-        moves: how it moves from here on; None for as the attributes say.
-        arrives: whether it may still be on its way to an assigned pose, in a scene that was paused.
-        known: scenes in which it was left, bool [B]; in others it is placed. None for all.
+        moves: its motion from here on; None for that of its attributes.
+        arrives: whether it may not have reached an assigned pose yet, in a scene that was paused.
+        known: scenes with a stored pose, bool [B]; in others it is placed at its attributes. None for all.
     """
 
     given: tuple[Any, ...]
@@ -130,7 +130,7 @@ def steady() -> Iterator[None]:
 
 
 Leave = Callable[[Any], Any]
-"""What the state after a control step passes, so that it stores where its obstacles are."""
+"""Function that stores the poses of obstacles in the state after a control step."""
 
 
 def control_step(
@@ -388,7 +388,7 @@ def course_of(obstacle: Obstacle, left: Left | None, span: Span, device: torch.d
 
 
 def _left_at(obstacle: Obstacle) -> Left:
-    """An obstacle that is where its attributes say."""
+    """An obstacle at the pose of its attributes."""
     values = _assigned(obstacle)
     copies = tuple(_copy(name, value) for name, value in zip(ASSIGNED, values, strict=True))
     given = tuple(as_remembered(value) for value in values)
@@ -446,7 +446,7 @@ def _copy(name: str, value: Any) -> Any:
 class _Part(NamedTuple):
     """The centre or the rotation of an obstacle: its pose at `start` and its rate, in a control step and after it.
 
-    `own` says whether the latter are the attributes; `arrives` and `contradicts` are as in `Left` and `Course`.
+    `own` states whether the latter are the attributes; `arrives` and `contradicts` are as in `Left` and `Course`.
     """
 
     during: tuple[Any, Any]
@@ -543,7 +543,7 @@ class _Changes:
         return jumps if self.left.known is None else jumps & self.left.known
 
     def of_known(self, part: _Part, own: tuple[Any, Any]) -> _Part:
-        """A part in the scenes in which the obstacle was left; in others it is placed as its attributes say."""
+        """A part in the scenes with a stored pose of the obstacle; in others that of its attributes."""
         known = self.left.known
         if known is None:
             return part

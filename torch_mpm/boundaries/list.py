@@ -11,10 +11,10 @@ from ..errors import shape_of
 
 
 class BoundaryList(nn.Module, MutableSequence[Any]):
-    """A list of boundaries, of which those that are modules are submodules.
+    """A list of boundaries; those that are modules are its submodules.
 
     Attributes:
-        entries: the same as a plain list, to be read only.
+        entries: the boundaries as a plain list; read-only.
 
     Raises:
         TypeError: for anything but a list, or an entry that is neither a module nor has a method `apply`.
@@ -28,7 +28,7 @@ class BoundaryList(nn.Module, MutableSequence[Any]):
 
     @property
     def reads_time(self) -> bool:
-        """Whether an entry looks at the time; one that does not say whether it does may."""
+        """Whether an entry may read the time: true for entries without the attribute `reads_time`."""
         return any(getattr(entry, "reads_time", True) for entry in self.entries)
 
     def __len__(self) -> int:

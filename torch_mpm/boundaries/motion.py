@@ -18,10 +18,10 @@ from .waypoints import Waypoints
 Path = Callable[[Tensor], "Tensor | Sequence[Any] | np.ndarray"]
 """A position as a function of time, [] or [B] to [D] or [B, D]: a tensor, an array, or D numbers or tensors."""
 PACE = 1e-4
-"""Time over which a path without a derivative is differenced where no step says one [s]."""
+"""Time over which a path without a derivative is differenced, unless a step sets it [s]."""
 
 REFUSALS = RuntimeError, TypeError, ValueError
-"""What functions of numbers raise where a transform of torch stands for the time."""
+"""Errors of functions of numbers that are given a tensor of a torch transform as the time."""
 
 
 class Pose(NamedTuple):
@@ -70,7 +70,7 @@ class RigidMotion(SceneParameters):
 
     @property
     def motion(self) -> RigidMotion:
-        """How it moves now: as its attributes say, or as `control` does."""
+        """Current motion: that of `control` during a control step, otherwise that of the attributes."""
         control = self._modules.get("control")
         return self if control is None else control  # type: ignore[return-value]
 
@@ -168,7 +168,7 @@ class RigidMotion(SceneParameters):
             return torch.vmap(self.at)(times)
         except torch.OutOfMemoryError:
             raise
-        except REFUSALS:  # as of functions that look at the value of a time. One that is wrong raises again.
+        except REFUSALS:  # of functions that read the value of a time; a wrong function raises again below
             return torch.stack([self.at(time) for time in times.unbind()])
 
     def _rates(self, times: Tensor, centre: Tensor) -> Tensor:

@@ -1,1 +1,1 @@
-"""What recordings of CUDA graphs share."""
+"""CUDA graphs: capture, replay, keys of recordings and their memory."""

@@ -13,13 +13,13 @@ from ..state.state import FIELDS, State
 from .capture import capturing
 
 PIECE, PIECES, LEAST_PARTICLES = 2**25, 4, 2**13
-"""Particles times steps of a piece of work, the pieces in flight, and the particles that take no less time than fewer
-(csrc/common/signals.op.cpp)."""
+"""Work of a piece, as particles times steps; number of pieces in flight; number of particles below which the time of a
+step does not decrease (csrc/common/signals.op.cpp)."""
 
 
 class _Latest(threading.local):
-    """For each stream of a thread, the one that graphs for it are captured on, and the latest of these graphs: the next
-    one runs after it, and takes the same memory, which the allocator gives to the same stream alone."""
+    """For each stream of a thread: the stream on which graphs for it are captured, and the latest of these graphs. The
+    next graph runs after that one and reuses its memory, which the allocator reuses within a stream only."""
 
     def __init__(self) -> None:
         self.captures: dict[tuple[torch.device, int], tuple[torch.cuda.Stream, torch.cuda.CUDAGraph | None]] = {}
@@ -29,12 +29,12 @@ _LATEST = _Latest()
 
 
 class WorkInFlight:
-    """Steps of graphs that the device has still to take: a fraction of a second, since nothing interrupts them and the
-    next wait for the device would hold a signal back.
+    """Bound on the launched work that the device has not done yet: a fraction of a second. Launched graphs cannot be
+    interrupted, so the next wait for the device would delay a signal by that time.
 
     Args:
         x: the positions of the particles.
-        steps: of a graph.
+        steps: number of steps of a graph.
     """
 
     def __init__(self, x: Tensor, steps: int = 1) -> None:

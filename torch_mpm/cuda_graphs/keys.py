@@ -30,10 +30,10 @@ class StepKey:
 
     def __init__(self, step: nn.Module) -> None:
         self._step = step
-        self.look()
+        self.refresh()
 
-    def look(self) -> None:
-        """Recomputed: the first steps create some of the stored values."""
+    def refresh(self) -> None:
+        """Read the step again: the first steps create some of its tensors."""
         step, modules = self._step, dict(self._step.named_modules())  # Once, since a device may be waiting.
         named: dict[int, tuple[str, Tensor]] = {}  # Each tensor by its first name.
         for place, module in modules.items():

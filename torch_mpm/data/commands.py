@@ -161,7 +161,7 @@ class _Bar:
     """Progress of a process: frames of scenes, their rate and the time left, if it makes all that is missing."""
 
     def __init__(self) -> None:
-        self._make = optional.load("tqdm", "the progress bar, which --quiet leaves out", "scene").tqdm
+        self._make = optional.load("tqdm", "the progress bar, which --quiet disables", "scene").tqdm
         self._bar: Any = None
 
     def show(self, figures: dict[str, Any]) -> None:

@@ -75,7 +75,7 @@ class Dataset(schema.Model):
     splits: Annotated[dict[Name, Annotated[int, Field(ge=0)]], Field(min_length=1)]
     """numbers of scenes by the name of a split, such as { train = 1000, valid = 30, test = 30 }"""
     frames: Annotated[int, Field(ge=2)]
-    """frames of a scene, the first among them"""
+    """number of frames of a scene, including the first"""
     interval: schema.Positive
     """time from frame to frame [s]"""
     fields: list[Literal["velocity"] | schema.StoredField] = Field(default_factory=list)

@@ -25,8 +25,7 @@ CHUNK_BYTES = 2**17
 """Approximate size of a chunk before compression: a window of some frames reads little more than itself."""
 GZIP_LEVEL = 1
 PIECE_BYTES = 2**20
-"""Approximate size of data processed at once: it fits in the cache, in few calls, each of which waits for Python's
-lock.
+"""Approximate size of data processed at once: it fits in the cache, and few calls wait for Python's lock.
 """
 
 

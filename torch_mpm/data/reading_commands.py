@@ -29,7 +29,7 @@ def add(commands: Any) -> None:
     stats.add_argument("-o", "--out", type=path_argument, help="the picture; statistics.png in the folder by default")
     stats.set_defaults(command=_stats)
 
-    view = commands.add_parser("view", help="look at a run or a data set in the browser")
+    view = commands.add_parser("view", help="show a run or a data set in the browser")
     view.add_argument("folder", type=path_argument, help="folder of a run or of a data set")
     view.add_argument("--port", type=_port, default=8080, help="default: %(default)s")
     view.add_argument("--host", default="127.0.0.1", help="address to listen at; default: %(default)s")

@@ -224,7 +224,7 @@ class Trajectory:
         except (KeyError, TypeError, ValueError, IndexError) as error:  # Attributes of another kind.
             problem = f"is no trajectory: {error}"
         if not problem and self.path.name == COMPLETE and len(self) < len(self.file["time"]):
-            problem = f"says that {len(self)} of its {len(self.file['time'])} frames are written, and was complete"
+            problem = f"states that {len(self)} of its {len(self.file['time'])} frames are written, and was complete"
         if problem:
             self.file.close()
             raise DamagedFileError(self.path, problem, self._remedy)
@@ -343,6 +343,6 @@ def _problem(file: Any) -> str:
             return f"{name} has a number that is not positive"
     written = int(file["frames_written"][0])
     if not 0 <= written <= frames:
-        return f"it says that {written} of its {frames} frames are written"
+        return f"it states that {written} of its {frames} frames are written"
     counts = file["particles"][:written]
     return f"it has frames of more than its {particles} particles" if (counts > particles).any() else ""

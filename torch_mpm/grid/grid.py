@@ -278,7 +278,7 @@ class Grid(Lattice):
 def same_pools(sizes: list[int]) -> Iterator[None]:
     """Context in which the pools of all activations get the sizes in a list, or are appended to it where it is empty.
 
-    Recomputed steps of the backward pass thus find pools of the original size, whatever came later.
+    Recomputed steps of the backward pass thus find pools of the original size.
     """
     if not sizes:
         _POOLS.recordings.append(sizes)

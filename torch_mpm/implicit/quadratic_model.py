@@ -20,9 +20,7 @@ from .system import ImplicitSystem
 TIGHTEST = 1e-12
 """Relative tolerance of linear solves."""
 FREE_ROUNDS, MOST_ROUNDS = 8, 20
-"""Numbers of linear solves with other components held: from the first number on no held component is released any
-more.
-"""
+"""Numbers of linear solves with other components held: from the first number on no held component is released."""
 
 
 class Tangents(NamedTuple):

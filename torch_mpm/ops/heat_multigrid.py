@@ -191,7 +191,7 @@ def _levels(
     """Levels from the finest to the coarsest; `diagonal` is that of the operator on the finest."""
     several = max(blocks.grid.blocks) > COARSEST
     levels = [_level(blocks, x, conductance, weight, free, diagonal, patches=several)]
-    # Held nodes have the weight of conduction on the coarse levels, which do not know them.
+    # Coarse levels have no held nodes: there, held nodes have the weight of conduction.
     weight = torch.where(held, diagonal, weight)
     while max(levels[-1].blocks.grid.blocks) > COARSEST:
         levels.append(_coarsen(levels[-1], weight))

@@ -146,8 +146,8 @@ def _row_over(obstacle: Obstacle, like: Tensor, times: StepTimes) -> Tensor:
 
 
 def _path_over(obstacle: Obstacle, like: Tensor, times: StepTimes) -> tuple[Tensor, Tensor]:
-    """Positions and velocities [n, 1 or B, D]. Where the host knows the time, a function is evaluated at times at which
-    the obstacle is present, as in single steps; zero at others.
+    """Positions and velocities [n, 1 or B, D]. If the times are numbers on the host, a function is evaluated at the
+    times at which the obstacle is present, as in single steps; zero at others.
     """
     n, there = len(times.tensor), times.within(obstacle.start, obstacle.end)
     moments = times.tensor[there].to(like.dtype)

@@ -160,7 +160,7 @@ def _backward(ctx: Any, *grads: Tensor | None) -> Any:
 
 
 def _placed(found: Sequence[Tensor], wanted: Places, tensors: Sequence[Tensor]) -> list[Tensor | None]:
-    """Gradients by row as those of the tensors, some of which are shared by all rows."""
+    """Gradients of the tensors from those by row: summed for tensors that all rows share."""
     result: list[Tensor | None] = [None] * len(tensors)
     for gradient, i in zip(found, wanted, strict=True):
         same = gradient.shape == tensors[i].shape

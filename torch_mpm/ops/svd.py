@@ -122,8 +122,8 @@ def _svd3_backward(ctx: Any, grad_U: Tensor | None, grad_sigma: Tensor | None, g
 
 
 def _polar_backward(ctx: Any, grad_R: Tensor | None, grad_S: Tensor | None) -> Tensor | None:
-    # dR = R Ω with the skew Ω of Ω S + S Ω = Rᵀ dF − dFᵀ R, and dS = Rᵀ dF − Ω S. With X the skew part of what
-    # multiplies Ω, the adjoint is 2 R Y with Y S + S Y = X.
+    # dR = R Ω with the skew Ω of Ω S + S Ω = Rᵀ dF − dFᵀ R, and dS = Rᵀ dF − Ω S. With X the skew part of the
+    # factor of Ω, the adjoint is 2 R Y with Y S + S Y = X.
     _, R, S = ctx.saved_tensors
     if grad_R is None and grad_S is None:
         return None

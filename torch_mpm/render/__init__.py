@@ -9,7 +9,7 @@
     render.assemble_video(sorted(folder.glob("frame_*.png")), "scene.mp4", fps=30)
 
 Three-dimensional scenes are drawn by VTK, which needs an OpenGL of the system (`apt-get install libosmesa6`, or libegl1
-and libgl1-mesa-dri); without one a logged warning says so and a plainer software picture is made.
+and libgl1-mesa-dri); without one a warning is logged and a plainer software picture is made.
 """
 
 from . import shapes

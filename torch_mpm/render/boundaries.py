@@ -14,7 +14,7 @@ from .requires import require
 from .shapes import GREY, Shape
 
 LEVEL_CELLS = 96
-"""Number of cells along the longest side of the domain for shapes that are only known by their distance."""
+"""Number of cells along the longest side of the domain for shapes that are defined by their distance only."""
 
 
 def obstacle_shapes(

@@ -50,7 +50,7 @@ class Renderer:
 
     Raises:
         ImportError: a package of the `render` extra is missing.
-        RenderError: backend is "vtk" and VTK finds no OpenGL; the message says what to install.
+        RenderError: backend is "vtk" and VTK finds no OpenGL; the message names the packages to install.
         ValueError: an argument has the wrong shape or value.
     """
 

@@ -17,7 +17,7 @@ VTK_SPACE = 1.4e9
 
 
 class RenderError(RuntimeError):
-    """A picture cannot be made on this machine; the message says what to install."""
+    """A picture cannot be made on this machine; the message names the packages to install."""
 
 
 def require(module: str) -> Any:

@@ -65,19 +65,19 @@ def _guarded(serve: Callable[..., Any], host: str) -> Callable[..., Any]:
     return guarded
 
 
-def is_own_page(origin: str | None, asked: str | None, host: str) -> bool:
+def is_own_page(origin: str | None, requested: str | None, host: str) -> bool:
     """Whether a connection comes from a page of the server, or from a program other than a browser.
 
     Args:
         origin: header of the request: the site of the page; None for a program.
-        asked: header of the request: host and port of the connection.
+        requested: header of the request: host and port of the connection.
         host: address that the server listens at. Names of other sites may resolve to a loopback address, so only the
             names of this machine are accepted there.
     """
     if origin is None:
         return True
     page = urlsplit(origin)
-    if page.scheme not in ("http", "https") or page.netloc != asked:
+    if page.scheme not in ("http", "https") or page.netloc != requested:
         return False
     return not _is_loopback(host) or _is_loopback(page.hostname or "")
 

@@ -14,14 +14,14 @@ from .checkpoints import Checkpoints, fitting
 from .memory import state_bytes, step_bytes
 
 PADDING = 87 * 64
-"""Between two rows of particles on the CPU at most [bytes], csrc/common/tensors.h."""
+"""Largest padding between two rows of particles on the CPU [bytes], csrc/common/tensors.h."""
 EVERYTHING = Checkpoints(memory=sys.float_info.max)
-"""Of a memory into which all steps fit."""
+"""Checkpoints with unlimited memory: all steps are stored."""
 
 
 KEPT_BYTES = {"cpu": 2**24, "cuda": 2**29}
-"""What the backward pass of one op may hold of its steps, even where sqrt(n) steps need less: what the caches of a CPU
-hold, and so much that kernels on CUDA hide the time of Python."""
+"""Memory that the backward pass of one op may use for its steps, even if sqrt(n) steps need less [bytes]: the size of
+the caches of a CPU; on CUDA enough that the kernels hide the time of Python."""
 
 
 def resolved(
@@ -32,7 +32,7 @@ def resolved(
     dt: float | Tensor,
     fused: bool,
 ) -> Checkpoints | None:
-    """Checkpoints of n steps that fit into a budget of memory; None where all steps do."""
+    """Checkpoints of n steps that fit into a budget of memory; None if all steps fit."""
     assert kept.memory is not None
     return fitting(kept.memory, n, *bytes_kept(step, state, dt, fused), kept.offload)
 
@@ -40,20 +40,20 @@ def resolved(
 def bytes_kept(
     step: Callable[[State, float | Tensor], State], state: State, dt: float | Tensor, fused: bool
 ) -> tuple[int, int]:
-    """Of a stored state, and of each step that the backward pass has recomputed, in one op or not [bytes]."""
+    """Sizes of a stored state and of a step that the backward pass recomputes, in one op or not [bytes]."""
     if isinstance(step, Step):
         state = step.prepare(state)
     return state_bytes(state), bytes_of_a_substep(state) if fused else step_bytes(step, state, dt)
 
 
 def steps_of_a_call(state: State, n: int) -> int:
-    """Between two kept states of a rollout in one op that says nothing else."""
+    """Default number of steps between two stored states, for rollouts in one op."""
     return max(math.isqrt(n), KEPT_BYTES[state.x.device.type] // max(bytes_of_a_substep(state), 1), 1)
 
 
 def bytes_of_a_substep(state: State) -> int:
-    """What the backward pass of the op holds of each step of a solid, at most [bytes]: of particles, and half as much
-    of the grid."""
+    """Upper bound of the memory that the backward pass of the op uses per step of a solid [bytes]: for the particles,
+    and half as much for the grid."""
     D, size = state.x.shape[1], state.x.element_size()
     rows = len(state) + (0 if state.x.is_cuda else PADDING // size)
     history = sum(t[0].numel() for t in state.extra.values()) if len(state) else 0

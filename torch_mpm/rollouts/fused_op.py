@@ -24,7 +24,7 @@ from ..step.pause import paused
 from ..step.step import Step
 from .checkpoints import binomial, offloaded
 from .plan import SCHEDULES, RolloutPlan, differentiates, follows_paths, why_not_fused
-from .sorting import STEPS_IN_ORDER, put_back, put_in_order
+from .sorting import STEPS_IN_ORDER, restore_order, sort_particles
 
 
 def in_calls(step: Step, state: State, n: int, dt: float | Tensor, plan: RolloutPlan) -> State:
@@ -53,15 +53,15 @@ def in_calls(step: Step, state: State, n: int, dt: float | Tensor, plan: Rollout
 
 
 def _in_order(step: Step, given: State, n: int, dt: float | Tensor, plan: RolloutPlan) -> State:
-    """`in_calls` of particles that are sorted now and then, and put back."""
+    """`in_calls` for particles that are sorted every `STEPS_IN_ORDER` steps, and restored to their order at the end."""
     assert plan.facts is not None
     most = n if plan.facts.gradients else STEPS_IN_ORDER
     plan = plan.of_sorted()
     end = given
     for first in range(0, n, most):
-        start = put_in_order(step, end)
+        start = sort_particles(step, end)
         end = in_calls(step, start, min(most, n - first), dt, plan)
-    return put_back(step, end, start, given)
+    return restore_order(step, end, start, given)
 
 
 def substeps(
@@ -73,8 +73,10 @@ def substeps(
     blocks: int | None = None,
     schedule: str | None = None,
 ) -> State:
-    """The state n steps later, by one call of the op; `why_not_fused` must be None. It `records` what gradients need,
-    if it has any, or recomputes the steps. The pool has room for `blocks` at least, or for those of the grid.
+    """The state n steps later, by one call of the op; `why_not_fused` must be None.
+
+    With `records` the inputs of the adjoint are stored; otherwise the backward pass recomputes the steps. The pool has
+    room for at least `blocks` blocks; None for as many as the grid has.
 
     Raises:
         ValueError: for a dt that is not positive and finite, or a material without a law.
@@ -92,17 +94,17 @@ def substeps_arguments(
 ) -> dict[str, Any]:
     """The arguments of `torch.ops.torch_mpm.substeps` by name, for training code that calls the op itself.
 
-    The op knows no paused scenes: each entry of a tensor dt must be positive. `Step.check` does not see its steps; its
-    status is the one after them, for which `previous_status` is the one before.
+    The op does not support paused scenes: each entry of a tensor dt must be positive. `Step.check` does not include the
+    steps of the op, which returns its own status; `previous_status` is the status before the steps.
 
     Args:
         step, state, n, dt: as `rollout`; n at most 65536.
-        records: whether the op keeps what gradients need, or its backward pass takes the steps again.
-        blocks: for which the pool has room; None for as many as the grid has now, which on CUDA must be enough for all
+        records: whether the op stores the inputs of the adjoint; otherwise its backward pass recomputes the steps.
+        blocks: number of blocks of the pool; None for as many as the grid has now. On CUDA they must suffice for all
             steps.
 
     Raises:
-        ValueError: where the op cannot take the steps, and why.
+        ValueError: the op does not support the steps; with the reason.
     """
     if not isinstance(step, Step):
         raise TypeError(f"step must be a Step, got {shape_of(step)}")
@@ -112,7 +114,7 @@ def substeps_arguments(
         check_count("blocks", blocks)
     check_state(state)
     if (reason := why_not_fused(step, state, dt)) is not None:
-        raise ValueError(f"step must be one that `substeps` can take, got one of which {reason}")
+        raise ValueError(f"step must be one that `substeps` supports, got a step that it does not: {reason}")
     return _arguments(step, step.with_residual(step.prepare(state), dt), n, dt, records, blocks)[0]
 
 
@@ -125,7 +127,7 @@ def _arguments(
     blocks: int | None,
     schedule: str | None = None,
 ) -> tuple[dict[str, Any], list[list[str]]]:
-    """Those of the op, in its order, and the names of the history of each law; of a prepared state."""
+    """Arguments of the op in its order, and the names of the history of each law, for a prepared state."""
     grid, law, boundaries = step.grid, step.law, step.boundaries.entries
     number, scene_dt, scene_time = clocks(state, dt, grid.scenes)
     times = StepTimes.of(state, n, dt, grid.scenes) if boundaries and follows_paths(step) else None

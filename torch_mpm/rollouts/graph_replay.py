@@ -10,19 +10,22 @@ from ..step.clocks import time_after
 from ..step.step import Step
 
 LEAST_STEPS = 6
-"""For which a step is recorded: that takes the host as long as one or two steps."""
+"""Least number of replays for which a step is recorded: a recording takes the host as long as one or two steps."""
 CHUNK = 64
-"""Steps between two looks at how many blocks are active, where the pool follows the scene on CUDA."""
+"""Steps between two queries of the number of active blocks, for a pool that grows with the scene on CUDA."""
 
 
 def replayed(step: Step, state: State, n: int, dt: float) -> State:
-    """The state n steps later, all but the first replays of a graph; a plan has it.
+    """The state n steps later: the first step from Python, the others as replays of a graph, for plans with the
+    executor "replay".
 
-    The first step from Python makes what steps keep, and asks about these tensors what would be a wait in the graph.
+    The first step creates the tensors that later steps reuse, and makes the checks that wait for the device, which a
+    graph cannot.
     """
     time = time_after(state.time, dt, n)
-    # What begins later is made now, too: in a graph, nobody knows what time it is. Where nobody asks it stays a number,
-    # but before the time zero, when obstacles begin that do not say otherwise.
+    # The time is a tensor in the graph, which cannot read the host's time, so that obstacles that begin later are
+    # part of it. It stays a number if no part of the step reads the time, except before time zero, the default begin
+    # of obstacles.
     if n > LEAST_STEPS and (step.reads_time or state.time < 0):
         state = state.replace(time=time_tensor(state))
     if n > 0:
@@ -35,8 +38,9 @@ def replayed(step: Step, state: State, n: int, dt: float) -> State:
 
 
 def replay_all(step: Step, function: Callable[[State], State], state: State, times: int, most: int) -> State:
-    """`function`, applied so many times, as replays of a graph; of `most` of them where nobody looks meanwhile whether
-    the pool must grow. One activation of the step must be before."""
+    """The state after `times` calls of `function`, as replays of a graph. A grid that grows is checked after at most
+    `most` replays, and has a larger pool and a new graph where that is too small. The step must have activated its grid
+    before."""
     graph: Replays | None = None
     in_flight = WorkInFlight(state.x)
     with step._activations.passing_graphs():

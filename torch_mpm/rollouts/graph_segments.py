@@ -1,4 +1,4 @@
-"""Steps with functions of the user's, and their gradients, from CUDA graphs: for training with networks in a step."""
+"""CUDA graphs of steps with user functions, and of their gradients, for training with networks in a step."""
 
 from __future__ import annotations
 
@@ -28,29 +28,34 @@ from ..step.status import counts_of, uncounted
 from ..step.step import Step
 
 TRIALS = 3
-"""Times that steps are taken from Python before they are recorded, as torch does: compilers of code of the user's look
-at the first ones."""
+"""Number of times that steps are computed from Python before they are recorded, as torch does: compilers of user code
+trace or tune in the first ones."""
 
 
-def captured(step: nn.Module, state: State | None, dt: float, n: int = 1) -> Captured:
-    """n steps as one CUDA graph, and their backward pass as another: for training with networks in a step, where
-    launching its kernels one by one takes longer than running them.
+def make_graphed_step(step: nn.Module, state: State | None, dt: float, n: int = 1) -> GraphedStep:
+    """Function of n steps as one CUDA graph, with the backward pass as another.
 
-        advance = torch_mpm.captured(step, state, dt=1e-4, n=8)
+    It serves training with networks in a step, where launching the kernels takes longer than running them.
+
+        advance = torch_mpm.make_graphed_step(step, state, dt=1e-4, n=8)
         for batch in data:
             loss(advance(batch)).backward()
 
-    A state of another kind (fields, shapes, dtypes, those that require gradients), another grad mode or autocast, a
-    larger pool of a grid without `max_blocks`, numbers, tensors and parts of the step that were assigned: for each of
-    them the first call records, which takes as long as a few rollouts of so many steps; the latest 8 recordings are
-    kept. So a pose of an obstacle that is assigned between two calls (see `Obstacle`) makes the next one record anew:
-    give the obstacle a path, or call `rollout`. Recordings share memory: as much as the largest one needs, with
-    gradients what autograd keeps of n steps, and the state and parameters before and after of each one.
+    A recording takes as long as a few rollouts of n steps, and the latest 8 are stored. A call records again after a
+    change of one of these:
 
-    Parameters and buffers are read anew in each call. Code, and numbers of modules of the user's, are those of the
-    recording, which calls the step some times; `state.time` is a tensor there. The graphs read and write the same
-    memory in each call: a backward pass that comes after another call takes the steps of its own once more.
-    `rollout(graph=n)` makes segments of such graphs.
+    - the fields of the state, their shapes and dtypes, and those that require gradients;
+    - the grad mode or autocast;
+    - the pool of a grid without `max_blocks`, if it grew;
+    - assigned numbers, tensors and parts of the step. For example, a pose assigned to an obstacle between two calls
+      (see `Obstacle`) makes the next call record: give the obstacle a path instead, or call `rollout`.
+
+    Recordings share memory: as much as the largest one needs (with gradients, everything that autograd stores for n
+    steps), and for each one the state and parameters before and after the steps.
+
+    Parameters and buffers are read in each call. Code, and numbers in user modules, are those of the recording, which
+    calls the step a few times with `state.time` as a tensor. The graphs read and write the same memory in each call: a
+    backward pass after another call recomputes its steps. `rollout(graph=n)` divides a rollout into such graphs.
 
     Args:
         step: a `Step`, or another module (state, dt) -> state; no hooks.
@@ -63,15 +68,15 @@ def captured(step: nn.Module, state: State | None, dt: float, n: int = 1) -> Cap
         A function state -> state n steps later, differentiable once; for one thread at a time.
 
     Raises:
-        TypeError, ValueError: for a wrong argument, and for a tensor with a gradient that takes part in the steps but
-            is not of the step.
-        RuntimeError: where something in the step waits for the device, which a graph cannot.
+        TypeError, ValueError: for a wrong argument, and for a tensor with a gradient that the steps read but that is
+            no parameter or buffer of the step.
+        RuntimeError: a part of the step waits for the device, which a graph cannot.
     """
     if not isinstance(step, nn.Module):
         raise TypeError(f"step must be a Step or another module (state, dt) -> state, got {shape_of(step)}")
     check_count("n", n, 1)
     refuse_hooks(step)
-    result = Captured(step, dt, int(n), Recordings())
+    result = GraphedStep(step, dt, int(n), Recordings())
     if state is not None:
         result.record(state)
     return result
@@ -80,17 +85,18 @@ def captured(step: nn.Module, state: State | None, dt: float, n: int = 1) -> Cap
 # ---- in rollouts
 
 
-def in_graphs(step: nn.Module, state: State, n: int, dt: float, most: int) -> State:
-    """The state n steps later, by graphs of `most` steps and of what is left; a plan has it.
+def graphed_steps(step: nn.Module, state: State, n: int, dt: float, most: int) -> State:
+    """The state n steps later, by graphs of `most` steps and one of the remaining steps, for plans with the executor
+    "graph".
 
-    What they read is kept for the backward pass, which replays the steps of all but the latest graph again.
+    The inputs of each graph are stored for the backward pass, which recomputes the steps of all but the last one.
     """
     recordings = step.__dict__.setdefault("_recordings", Recordings())
     known = StepKey(step)
     in_flight = WorkInFlight(state.x, most)
     while n > 0:
         count = min(n, most)
-        state = Captured(step, dt, count, recordings).after(state, known, alike=True)
+        state = GraphedStep(step, dt, count, recordings).after(state, known, alike=True)
         in_flight.launched()
         n -= count
     return state
@@ -106,15 +112,16 @@ def has_graphs(device: torch.device) -> bool:
 
 
 def another_device(step: nn.Module, device: torch.device) -> torch.device | None:
-    """Of a parameter or buffer of a step, whose value would go into a graph as a number; None where there is none."""
+    """Another device that a parameter or buffer of the step is on, whose value would be a constant in a graph; None
+    without one."""
     return next((t.device for t in (*step.parameters(), *step.buffers()) if t.device != device), None)
 
 
 # ---- calls
 
 
-class Captured:
-    """What `captured` returns: a function state -> state."""
+class GraphedStep:
+    """Result of `make_graphed_step`: a function state -> state."""
 
     def __init__(self, step: nn.Module, dt: float, n: int, recordings: Recordings) -> None:
         self._step, self._dt, self._n, self._recordings = step, dt, n, recordings
@@ -125,7 +132,7 @@ class Captured:
             return left(self.after(state, StepKey(self._step)))
 
     def record(self, state: State) -> None:
-        """For a kind of states, in the grad mode and autocast of now."""
+        """Record the steps for states like this one, in the current grad mode and autocast."""
         known = StepKey(self._step)
         self._recording(self._prepared(state), known, False)
 
@@ -134,9 +141,9 @@ class Captured:
 
         Args:
             state: the state.
-            known: of the step as it is now.
-            alike: whether all that steps change counts as if it required a gradient once something does, so that
-                segments of a rollout are of one kind.
+            known: key of the step as it is now.
+            alike: whether all fields that steps change count as requiring a gradient if any input does, so that one
+                recording serves all segments of a rollout.
         """
         prepared = self._prepared(state)
         recording, given = self._recording(prepared, known, alike)
@@ -153,7 +160,7 @@ class Captured:
         return _with(prepared, results | recording.steps.dropped)
 
     def _check(self, device: torch.device) -> None:
-        """That the step can be recorded now.
+        """Check that the step can be recorded now.
 
         Raises:
             ValueError: for a step with hooks, or with a tensor on another device.
@@ -163,7 +170,7 @@ class Captured:
             raise ValueError(f"step must be on the device of the state, {device}, got a tensor on {place}")
 
     def _prepared(self, state: State) -> State:
-        """With the fields that steps need, and its time as a tensor."""
+        """The state with the fields that steps need, and with its time as a tensor."""
         check_state(state)
         if not has_graphs(state.x.device):
             raise ValueError(f"state must be on a CUDA device, got {state.x.device}")
@@ -177,7 +184,7 @@ class Captured:
         return state.replace(time=time_tensor(state))
 
     def _recording(self, prepared: State, known: StepKey, alike: bool) -> tuple[_Recording, list[Tensor]]:
-        """The recording that serves a state, made where there is none, and what it reads."""
+        """The recording for a state, made if there is none, and its inputs."""
         inputs = tensors_of(prepared) | known.own
         fixed = {name: self._recordings.same_content(name, inputs.pop(name)) for name in known.by_content(prepared)}
         wanted = {name for name, t in inputs.items() if torch.is_grad_enabled() and t.requires_grad}
@@ -193,7 +200,7 @@ class Captured:
             self._check(prepared.x.device)
             steps = _Steps(self._step, self._dt, self._n, prepared, fixed, list(inputs))
             recording = _Recording(steps, inputs, wanted, self._recordings)
-            known.look()
+            known.refresh()
             self._recordings.keep((kinds, around, known.key, known.pools()), recording)
         return recording, [inputs[name] for name in recording.steps.names]
 
@@ -213,12 +220,12 @@ class _Steps:
     """Steps as a function of tensors to tensors: those of the state, and those of the step that may have gradients.
 
     Args:
-        fixed: fields that are no arguments, and the same tensors in each call.
-        names: of the arguments.
+        fixed: fields that are no arguments: the same tensors in each call.
+        names: names of the arguments.
 
     Attributes:
-        changed: of the results; dropped: fields that are no tensors after the steps: None, or a time that is a number.
-            Known after a call.
+        changed: names of the results.
+        dropped: fields that are no tensors after the steps: None, or the time as a number. Both are set by a call.
     """
 
     def __init__(
@@ -239,7 +246,7 @@ class _Steps:
         given = dict(zip(self.names, tensors, strict=True))
         own = {name.removeprefix("step."): given.pop(name) for name in self.names if name.startswith("step.")}
         state = begin = _with(self._like, given).replace(**self._fixed)
-        self._like = begin.detach()  # so that the first state may go, and what it follows from
+        self._like = begin.detach()  # so that the first state and its autograd graph can be freed
         with steady():
             for _ in range(self._n):
                 state = torch.func.functional_call(self.step, own, (state, self._dt))
@@ -257,7 +264,7 @@ class _Call:
 
     def __init__(self, step: nn.Module, recordings: Recordings, recording: _Recording) -> None:
         self._step, self._recordings, self.recording = step, recordings, recording
-        self._mark = object()  # of this call in the recordings, which must not keep it
+        self._mark = object()  # identifies this call in the recordings, which must not keep the call alive
         self._random = _random_numbers(recording.steps.device) if recording.wanted else None
 
     def forward(self, given: Sequence[Tensor]) -> list[Tensor]:
@@ -266,14 +273,14 @@ class _Call:
             return [t.clone() for t in self.recording.graphs.forward(given)]
 
     def gradients(self, given: Sequence[Tensor], grads: Sequence[Tensor | None]) -> list[Tensor | None]:
-        """By the arguments; None where there is none."""
+        """Gradients with respect to the arguments; None where there is none."""
         graphs = self.recording.graphs
         with self._recordings.in_turn(self.recording.steps.device):
             if self._recordings.latest is not self._mark:
                 with uncounted(self._step), self._same_random_numbers():
                     graphs.forward(given)
-            self._recordings.latest = None  # the backward pass makes use of the memory of what it has read
-            # The next replay writes over its gradients.
+            self._recordings.latest = None  # the backward pass overwrites its inputs
+            # The next replay overwrites its gradients.
             return [None if grad is None else grad.clone() for grad in graphs.backward(grads)]
 
     @contextlib.contextmanager
@@ -293,7 +300,7 @@ def _random_numbers(device: torch.device) -> Tensor:
 
 
 class _Replayed(torch.autograd.Function):
-    """The steps of a call as one operation, which keeps its arguments alone."""
+    """The steps of a call as one operation, for which only the arguments are stored."""
 
     @staticmethod
     def forward(ctx: Any, call: _Call, *given: Tensor) -> tuple[Tensor, ...]:
@@ -315,7 +322,7 @@ class _Replayed(torch.autograd.Function):
 
 
 class _Recording:
-    """Steps from a kind of states, their gradients, and what they tell of the blocks that they want."""
+    """Graphs of steps and their gradients for one kind of states, with the status tensors that count their blocks."""
 
     def __init__(self, steps: _Steps, inputs: Mapping[str, Tensor], wanted: set[str], recordings: Recordings) -> None:
         self.steps, self.wanted = steps, bool(wanted)
@@ -327,7 +334,7 @@ class _Recording:
             stack.enter_context(torch.inference_mode(False))
             stack.enter_context(torch.set_grad_enabled(with_gradients))
             stack.enter_context(no_hooks())
-            # A cache of casts would keep parameters as they were.
+            # A cache of casts would hold old values of parameters.
             casts, dtype = autocast_of(device)
             stack.enter_context(torch.autocast(device.type, dtype, casts, cache_enabled=False))
             self.graphs = Graphs(steps, [inputs[name] for name in names], [name in wanted for name in names])
@@ -335,14 +342,14 @@ class _Recording:
                 for _ in range(TRIALS):
                     self.graphs.try_out()
             self.graphs.record(None if kept is None else kept.graphs)
-        # Which the graphs read, and mixtures give up for those of other particles.
+        # The graphs read these tensors, which mixtures replace for other particles.
         self._indices = [m.indices for m in steps.step.modules() if isinstance(m, Mixture)]
-        self._counts = [count for _, _, count in counts_of(steps.step)]  # to which they write
+        self._counts = [count for _, _, count in counts_of(steps.step)]  # The graphs write to these.
         parts = [m for m in steps.step.modules() if isinstance(m, Step)]
         self._statuses = [(part.grid, part.status) for part in parts if part.status is not None]
 
     def watch(self, recordings: Recordings) -> None:
-        """Ask the device how many blocks the latest steps wanted, unless it has not answered yet."""
+        """Request the block count of the latest steps from the device, unless a request is pending."""
         for grid, status in self._statuses:
             if not grid.watches:
                 recordings.unseen = 0
@@ -351,9 +358,10 @@ class _Recording:
 
 
 def no_hooks() -> contextlib.AbstractContextManager[Any]:
-    """Where what autograd keeps is none of what a checkpoint around a rollout counts, or moves to the host."""
+    """Context without the hooks of a surrounding checkpoint, which would count tensors saved by autograd or move them
+    to the host."""
     if torch._C._autograd._top_saved_tensors_default_hooks(True) is None:
-        return contextlib.nullcontext()  # as transforms want it
+        return contextlib.nullcontext()  # transforms refuse hooks
     return torch.autograd.graph.saved_tensors_hooks(lambda t: t, lambda t: t)
 
 
@@ -364,10 +372,10 @@ class Graphs:
     Args:
         steps: the function; it must not wait for the device.
         given: its arguments.
-        wanted: of which there are gradients.
+        wanted: whether the gradient by an argument is computed, for each of them.
 
     Attributes:
-        follows: whether a result has a gradient, for each of them; known after `record`.
+        follows: whether a result has a gradient, for each of them; set by `record`.
     """
 
     def __init__(
@@ -379,17 +387,18 @@ class Graphs:
         self.follows: list[bool] = []
 
     def try_out(self) -> None:
-        """Call the function and its gradients once, on the stream of graphs: what they make at a first call is none.
+        """Call the function and its gradients once on the stream of graphs, so that work of a first call is done before
+        the recording.
 
         Raises:
-            ValueError: where gradients would pass to something that is no argument, whose replays would lose them.
+            ValueError: gradients would pass to a tensor that is no argument, and replays would lose them.
         """
         with _on_own_stream(self._device):
             ends = self._steps(*self.read)
             if other := next(_others(ends, self.read), None):
                 raise ValueError(
                     "a tensor that requires a gradient must be a parameter or buffer of the step or a field of the "
-                    f"state to take part in steps from CUDA graphs, got {other}: make the function that reads it a "
+                    f"state in steps from CUDA graphs, got {other}: make the function that reads it a "
                     "torch.nn.Module that has it"
                 )
             self._gradients(ends, [torch.zeros_like(t) for t in ends if t.requires_grad])
@@ -399,12 +408,12 @@ class Graphs:
         if not outputs:
             return [None] * len(self.read)
         wanted = [t for t in self.read if t.requires_grad]
-        with torch.autocast(self._device.type, enabled=False):  # as backward passes are taken
+        with torch.autocast(self._device.type, enabled=False):  # as in every backward pass
             found = iter(torch.autograd.grad(outputs, wanted, grads, allow_unused=True))
         return [next(found) if t.requires_grad else None for t in self.read]
 
     def record(self, beside: Graphs | None) -> None:
-        """Make the graphs, in the memory of others where there are some."""
+        """Record the graphs, in the memory of `beside` if given."""
         self._forward, self._backward = torch.cuda.CUDAGraph(), torch.cuda.CUDAGraph()
         self._memory: _GraphMemory = _GraphMemory(self._device) if beside is None else beside._memory
         with _into(self._forward, self._memory.pool, self._device):
@@ -418,14 +427,14 @@ class Graphs:
         self._ends = [t.detach() for t in ends]
 
     def forward(self, given: Sequence[Tensor]) -> Sequence[Tensor]:
-        """The results, in memory that the next replay writes to."""
+        """The results, in memory that the next replay overwrites."""
         with torch.no_grad():
             copy_all(self.read, given)
         self._forward.replay()
         return self._ends
 
     def backward(self, grads: Sequence[Tensor | None]) -> Sequence[Tensor | None]:
-        """Gradients by the arguments of the latest replay, from those by the results."""
+        """Gradients with respect to the arguments of the latest replay, from those of the results."""
         self._take(grads)
         self._backward.replay()
         return self._found
@@ -440,7 +449,7 @@ class Graphs:
 
 
 def _others(ends: Sequence[Tensor], read: Sequence[Tensor]) -> Iterator[str]:
-    """In words, the leaves beside the tensors that are read to which gradients of results would pass."""
+    """Descriptions of leaves to which gradients of the results would pass, other than the tensors that are read."""
     waiting: list[Any] = [t.grad_fn for t in ends if t.grad_fn is not None]
     known = set[Any]()
     while waiting:
@@ -454,11 +463,11 @@ def _others(ends: Sequence[Tensor], read: Sequence[Tensor]) -> Iterator[str]:
 
 
 class _Streams(threading.local):
-    """The stream of a thread for each device on which graphs are captured: libraries keep memory for each stream.
+    """Streams of a thread on which graphs are captured, one per device, since libraries allocate memory per stream.
 
     Attributes:
         of: the stream of a device.
-        unused: graphs that are not replayed any more, each of which holds memory for later ones of its device.
+        unused: graphs that are no longer replayed; each holds memory for later graphs of its device.
     """
 
     def __init__(self) -> None:
@@ -470,10 +479,10 @@ _STREAMS = _Streams()
 
 
 class _GraphMemory:
-    """Memory that graphs share: that of graphs which are gone, where there is some.
+    """Memory shared by graphs, reused from destroyed graphs if possible.
 
-    The allocator keeps the memory of a graph that is gone until it is short of memory, and other processes cannot have
-    it. So the last user of the memory leaves one graph behind, whose memory the next recording takes.
+    The allocator does not free the memory of a destroyed graph for other processes until it runs short. Therefore the
+    last user of the memory stores one graph, and the next recording reuses its memory.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -498,8 +507,8 @@ class _GraphMemory:
 def _on_own_stream(device: torch.device) -> Iterator[None]:
     """The stream of graphs as the current one, in order with the work before and after.
 
-    The current stream waits on every way out, an exception included: memory of its tensors goes back to its allocator
-    then, and would be given out again while kernels of the other stream still read it.
+    The current stream waits on every exit, exceptions included. Otherwise memory of its tensors, freed at the exit,
+    could be reused while kernels of the other stream still read it.
     """
     now, stream = torch.cuda.current_stream(device), _STREAMS.of(device)
     stream.wait_stream(now)
@@ -512,7 +521,7 @@ def _on_own_stream(device: torch.device) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _into(graph: torch.cuda.CUDAGraph, pool: Any, device: torch.device) -> Iterator[None]:
-    """Operations go into a graph with the memory of a pool, None for new memory."""
+    """Context whose operations are captured in a graph with the memory of a pool; None for new memory."""
     torch.cuda.synchronize(device)
     with _on_own_stream(device), capturing(graph, pool, device):
         yield

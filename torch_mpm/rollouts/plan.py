@@ -38,7 +38,7 @@ from .graph_replay import LEAST_STEPS
 
 Executor = Literal["fused", "replay", "graph", "loop"]
 SCHEDULES = ("per_step", "fused_g2p2g", "persistent", "block_per_scene", "sorted_cpu")
-"""Of the fused op, in the order of csrc/rollout/plan.h."""
+"""Schedules of the fused op, in the order of csrc/rollout/plan.h."""
 _WORDS = {
     "fused": "all steps in one op",
     "replay": "from a CUDA graph of one step",
@@ -87,12 +87,12 @@ class CallPlan(NamedTuple):
 
     schedule: str
     max_blocks: int | None
-    """Blocks for which its pool has room at least; None for those of the grid."""
+    """Least number of blocks of its pool; None for those of the grid."""
     steps: int
-    """At most."""
+    """Largest number of steps of the call."""
     order: int
-    """Of particles that nobody has sorted: 0 as given; 1 sorted before the call and put back after it; 2 sorted by the
-    schedule itself."""
+    """Order of unsorted particles: 0 as given; 1 sorted before the call and restored after it; 2 sorted by the schedule
+    itself."""
     reasons: tuple[tuple[str, str], ...]
     """Why each other schedule was not chosen."""
 
@@ -117,10 +117,10 @@ class RolloutPlan:
     Attributes:
         executor: "fused" for calls of one op; "replay" for replays of a CUDA graph of one step; "graph" for CUDA graphs
             of some steps with their gradients (`rollout(graph=)`); "loop" for steps from Python.
-        schedule: of the first call of the fused op, see docs/architecture.md; None for other executors.
+        schedule: of the first call of the fused op, see docs/schedules; None for other executors.
         steps_per_call: steps of a call of the op, or of a graph, at most.
-        max_blocks: blocks for which the pool of the first call has room at least; None for those of the grid.
-        sorts: whether particles are sorted before the steps, and put back after them.
+        max_blocks: least number of blocks of the pool of the first call; None for those of the grid.
+        sorts: whether particles are sorted before the steps, and restored to their order after them.
         checkpoints: which states are stored for the backward pass; None for those of the fused op itself, or for all.
             `Checkpoints(memory=...)` has become the number of states that fits.
         reasons: why each other executor and schedule was not chosen, by name.
@@ -161,7 +161,7 @@ class RolloutPlan:
         words = _WORDS[self.executor]
         if self.executor == "fused":
             assert self.facts is not None
-            words = "all steps between two kept states in one op" if self.facts.gradients else words
+            words = "all steps between two stored states in one op" if self.facts.gradients else words
             return f"{words} (executor fused, schedule {self.schedule})"
         if self.executor == "graph":
             words += f" of {self.steps_per_call} steps"
@@ -190,7 +190,7 @@ def plan_rollout(
     Args:
         step, state, n, dt, checkpoint, graph: as `rollout`.
         schedule: the schedule of the fused op: "per_step", "fused_g2p2g", "persistent", "block_per_scene" or
-            "sorted_cpu" (docs/architecture.md). None: the fastest one.
+            "sorted_cpu" (docs/schedules). None: the fastest one.
 
     Raises:
         TypeError, ValueError: for a wrong argument, and for a schedule that does not support the steps, with the
@@ -226,11 +226,13 @@ def plan_of_steps(
     if no_op is None:
         return _fused(step, state, n, dt, checkpoints, schedule)  # type: ignore[arg-type]
     if schedule is not None:
-        raise ValueError(f"schedule must be None where steps are not taken in one op, got {schedule!r}: {no_op}")
+        raise ValueError(
+            f"schedule must be None for steps that the fused op does not support, got {schedule!r}: {no_op}"
+        )
     reasons = {"fused": no_op}
     no_replay = _why_not_replay(step, state, n, dt)
     if no_replay is None:
-        reasons |= {"graph": "replays of one step need nothing of the user's", "loop": "a graph is faster"}
+        reasons |= {"graph": "replays of one step suffice without user functions", "loop": "a graph is faster"}
         return RolloutPlan("replay", None, 1, None, False, checkpoints, reasons)
     reasons["replay"] = no_replay
     no_graph = _why_not_graphs(step, state, dt)
@@ -322,7 +324,7 @@ def _why_not_eager(x: Tensor) -> str | None:
     """Reason why steps must be launched from Python one by one, where other code observes them."""
     if torch.compiler.is_compiling() or is_traced(x) or is_captured(x) or is_transformed():
         return "it is compiled, captured or transformed"
-    return "anomaly detection looks at every step" if detecting() else None
+    return "anomaly detection inspects every step" if detecting() else None
 
 
 def _why_no_graph(step: nn.Module, state: State, dt: float | Tensor) -> str | None:
@@ -337,7 +339,7 @@ def _why_no_graph(step: nn.Module, state: State, dt: float | Tensor) -> str | No
     if any(part.integrator is not None for part in steps):
         return "an implicit step waits for its solve"
     if any(part.heat is not None and part.heat.method == "multigrid" for part in steps):
-        return "multigrid does all of its iterations in a graph"
+        return "multigrid computes its largest number of iterations in a graph"
     return None
 
 
@@ -360,7 +362,7 @@ def _why_not_replay(step: Any, state: State, n: int, dt: float | Tensor) -> str 
 
 
 def _why_not_graphs(step: Any, state: State, dt: float | Tensor) -> str | None:
-    """Reason why `in_graphs` does not support the steps; None if it does."""
+    """Reason why `graphed_steps` does not support the steps; None if it does."""
     if not isinstance(step, nn.Module):
         return "it is no module"
     if not graph_segments.has_graphs(state.x.device):
@@ -377,7 +379,7 @@ _OWN = (GraphCache, Recordings, ActivationRecord, Grid)
 
 
 def _foreign(part: Any, device: torch.device, seen: list[Any]) -> str | None:
-    """What a step, or a part of it, has of the user's, or on another device; None for nothing."""
+    """Description of a user object, or of a tensor on another device, in a step or a part of it; None without one."""
     if part is None or isinstance(part, NUMBERS) or type(part) in _OWN or any(part is known for known in seen):
         return None
     if isinstance(part, Tensor):
@@ -390,7 +392,7 @@ def _foreign(part: Any, device: torch.device, seen: list[Any]) -> str | None:
     elif _is_known(part):
         members = list(vars(part).values())
     else:
-        return f"it has something of the user's, {shape_of(part)}"
+        return f"it contains a user object, {shape_of(part)}"
     return next(filter(None, (_foreign(member, device, seen) for member in members)), None)
 
 
@@ -454,7 +456,7 @@ def _is_uniform(law: Any) -> bool:
 
 
 def _path_bytes(step: Step, state: State, dt: float | Tensor) -> int:
-    """Of the table of obstacles on paths, in a step [bytes]; zero without such obstacles."""
+    """Size of the table of obstacles on paths, per step [bytes]; zero without such obstacles."""
     if not follows_paths(step):
         return 0
     clocks_of_scenes = isinstance(dt, Tensor) or isinstance(state.time, Tensor)
@@ -480,7 +482,7 @@ def wants_gradient(step: Step, state: State, n: int = 1, dt: float | Tensor = 1.
 
 
 def differentiates(step: Step, state: State, dt: float | Tensor) -> bool:
-    """The same, whatever functions of time return."""
+    """The same, without the results of functions of time."""
     return requires_grad(dt) or any(t.requires_grad for t in _differentiable(step, state))
 
 
@@ -494,7 +496,7 @@ def _obstacles(step: Step) -> list[Obstacle]:
 
 
 def _differentiable(step: Step, state: State) -> list[Tensor]:
-    """What the fused op has gradients for."""
+    """Tensors that the fused op is differentiable by."""
     fields = (
         state.x,
         state.v,

@@ -19,7 +19,7 @@ from .checkpoints import Checkpoints, as_checkpoints, binomial, in_segments
 from .fused_op import in_calls
 from .gradient_norms import GradientNorms
 from .graph_replay import replayed
-from .graph_segments import in_graphs
+from .graph_segments import graphed_steps
 from .hooks import Hook, Parts
 from .plan import RolloutPlan, plan_of_steps, why_not_fused
 
@@ -47,42 +47,50 @@ def rollout(
         state: the initial state.
         n: number of steps.
         dt: time step [s], as `Step` takes it.
-        checkpoint: what is kept for the backward pass, which takes the steps between again: the state of every so many
-            steps (memory n/checkpoint + checkpoint states instead of n steps; sqrt(n) is best), or what `Checkpoints`
-            says: so many states, a budget of memory, states that wait on the host. None: all steps.
-        prefix: number of first steps that are taken without gradients.
-        truncate: if given, gradients pass back through so many steps at most: the graph is cut before the steps
-            n - truncate, n - 2 truncate, ... Without a hook that is a prefix of n - truncate steps.
-        hook: called as `hook(state, k)` before step k = 0, every, 2 every, ...; it may look at the state, add to a
-            loss, or return another state of as many particles. Where a hook acts a state is kept.
-        every: steps from one call of the hook to the next.
+        checkpoint: states to store for the backward pass, which recomputes the steps in between. A number: every
+            `checkpoint` steps; the memory is that of n/checkpoint states and of checkpoint steps, and is smallest for
+            sqrt(n). A `Checkpoints`: by a number of states or a budget of memory, on the device or on the host. None:
+            sqrt(n) states for steps in one op; otherwise all steps are stored.
+        prefix: number of first steps that are computed without gradients.
+        truncate: number of steps through which gradients pass back at most: the graph is cut before the steps
+            n - truncate, n - 2 truncate, ... Without a hook this is a prefix of n - truncate steps. None: all steps.
+        hook: called as `hook(state, k)` before step k = 0, every, 2 every, ...; it may read the state, add to a loss,
+            or return another state with as many particles. The state at each call is stored.
+        every: number of steps between two calls of the hook.
         norms: records the norm of the gradient at states on the way; see `GradientNorms`.
-        graph: steps from Python, on CUDA, are replays of CUDA graphs of so many of them, functions of the user's among
-            them, and in the backward pass of these and of a graph of their gradients: for networks in a step, whose
-            kernels take the host longer than the device. The state of every `graph` steps is kept, and its steps are
-            taken again. See `captured` for what is recorded, and when anew; the step keeps the graphs for the next
-            rollout. It must be a `Step` or another module. On the CPU, and where `Step.explain` gives a reason against
-            it, steps are taken as without.
-        schedule: of steps in one op, see `plan_rollout`; None for the fastest one.
-        plan: the plan of `plan_rollout` for these steps, in place of `checkpoint`, `graph` and `schedule`. By default
-            the rollout makes it.
+        graph: number of steps per CUDA graph, for steps that the fused op does not support, user functions included;
+            a second graph computes their gradients. It pays for networks in a step, where launching the kernels takes
+            longer than running them. The state is stored every `graph` steps, and the backward pass recomputes the
+            steps in between. The step stores the graphs for the next rollout; `make_graphed_step` describes when they
+            are recorded again. `step` must be a `Step` or another module. Without effect on the CPU, and where
+            `Step.explain` gives a reason against graphs.
+        schedule: schedule of the fused op, see `plan_rollout`; None for the fastest one.
+        plan: the plan of `plan_rollout` for these steps, in place of `checkpoint`, `graph` and `schedule`. None: the
+            rollout makes it.
 
-    A `Step` of compiled laws without heat and functions of the user's takes all steps in one op, or some, with the
-    results of single steps; `Step.explain` tells. On CUDA they are the same to the last bit, but for float32 without
-    gradients, which like all of a CPU rounds differently, and for many particles that nobody has sorted (`state.ids` is
-    None), which are sorted for 64 steps and more, and put back; the status does not count blocks that are there only
-    between two activations. Its gradients take the steps again from kept states, those of every `checkpoint` steps,
-    sqrt(n) of them by default and more where states are small. A kept state of a solid has 2 D + 2 D² numbers per
-    particle (24 in 3-D, 96 bytes in float32) and its history; while the backward pass goes through `checkpoint` steps,
-    it holds about 2 D + 4 D² (42 in 3-D) for each of them, and half as much of the grid at most. Where all steps fit
-    into `Checkpoints(memory=...)` that is kept instead, and none is taken again. Second derivatives need single steps.
-    On CUDA and without gradients, other steps that call no function of the user's are replays of a CUDA graph of one;
-    see `captured` for what else there is, and `estimate_rollout` for what a rollout will take. Under
-    `torch.autograd.detect_anomaly` a gradient that is NaN is reported with its operation, substep and scene.
+    A `Step` of compiled laws, without heat and without user functions, computes all steps in one op, or in a few calls
+    of it; `Step.explain` returns the executor, the schedule and the reasons. The results are those of single steps. On
+    CUDA they are bitwise equal, with two exceptions, which round differently, as all steps on a CPU do:
+
+    - float32 without gradients;
+    - many unsorted particles (`state.ids` is None): for 64 steps or more they are sorted first, and restored to their
+      order at the end.
+
+    The status does not count blocks that exist only between two activations.
+
+    The backward pass of the op recomputes the steps from stored states: one every `checkpoint` steps, by default
+    sqrt(n) of them, and more where states are small. A stored state of a solid has 2 D + 2 D² numbers per particle (24
+    in 3-D, 96 bytes in float32) and its history. While the backward pass processes `checkpoint` steps, it stores about
+    2 D + 4 D² numbers per particle (42 in 3-D) for each of them, and at most half as much for the grid. If all steps
+    fit into `Checkpoints(memory=...)`, they are stored and not recomputed. Second derivatives need single steps.
+
+    On CUDA and without gradients, other steps without user functions are replays of a CUDA graph of one step.
+    `make_graphed_step` serves steps with user functions, and `estimate_rollout` returns the memory and time of a
+    rollout. Under `torch.autograd.detect_anomaly` a NaN gradient is reported with its operation, substep and scene.
 
     Raises:
         TypeError, ValueError: for a number of steps that is no whole number or out of range, a schedule that does
-            not support the steps, a plan that is not for them, or what `step` raises.
+            not support the steps, a plan for other steps, or an error of `step`.
     """
     if not callable(step):
         raise TypeError(f"step must be a Step or a function (state, dt) -> state, got {shape_of(step)}")
@@ -133,13 +141,13 @@ def _taken(
     schedule: str | None = None,
     given: RolloutPlan | None = None,
 ) -> State:
-    """The state n steps later, of which the first is step `first` of a rollout; by the plan of these steps, which must
-    have the executor of a given one."""
+    """The state n steps later, by the plan of these steps. `first` is the index of the first one in the rollout. The
+    executor of a given plan must be that of the plan of these steps."""
     if isinstance(step, Step):
         state = step.with_residual(state, dt)
     plan = plan_of_steps(step, state, n, dt, kept, graph, schedule)
     if given is not None and given.executor != plan.executor:
-        reason = plan.reasons.get(given.executor, "another executor takes them")
+        reason = plan.reasons.get(given.executor, "another executor computes them")
         raise ValueError(f"plan must be one for these steps, got the executor {given.executor!r}: {reason}")
     if plan.executor == "fused":
         return in_calls(step, state, n, dt, plan)  # type: ignore[arg-type]
@@ -162,7 +170,7 @@ def _from_python(
 
     def single(state: State, count: int, begins: int) -> State:
         if plan.executor == "graph":
-            return in_graphs(step, state, count, dt, plan.steps_per_call)  # type: ignore[arg-type]
+            return graphed_steps(step, state, count, dt, plan.steps_per_call)  # type: ignore[arg-type]
         for k in range(first + begins, first + begins + count):
             mark = begin() if detecting() else None
             before, state = state, step(state, dt)

@@ -15,16 +15,17 @@ STEPS_IN_ORDER = 1024
 """Number of steps after which particles are sorted again."""
 
 
-def put_in_order(step: Step, state: State) -> State:
+def sort_particles(step: Step, state: State) -> State:
     """Sorted state, with materials marked as checked."""
     if isinstance(step.law, Mixture):
         step.law.check_material(state)
     return step.sorted(state)
 
 
-def put_back(step: Step, end: State, start: State, given: State) -> State:
-    """State in the order of `given`, which was sorted to `start`, from which steps led to `end`. Differentiable."""
-    if isinstance(step.law, Mixture):  # Only the latest materials are known to be checked.
+def restore_order(step: Step, end: State, start: State, given: State) -> State:
+    """The state `end` in the order of `given`. `start` is `given` sorted, and `end` the state after steps from it.
+    Differentiable."""
+    if isinstance(step.law, Mixture):  # Marks of checked materials exist for the latest ones only.
         step.law.reordered(start.material, given.material)
     ids, before, own = start.ids, _tensors(start), _tensors(given)
     assert ids is not None

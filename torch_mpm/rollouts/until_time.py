@@ -19,7 +19,7 @@ from .fused_op import in_calls
 from .graph_replay import CHUNK, replay_all
 from .plan import RolloutPlan, facts_of, follows_paths, plan_call, plan_of_steps
 from .run import rollout
-from .sorting import put_back, put_in_order
+from .sorting import restore_order, sort_particles
 
 SEGMENT = 16
 """Substeps between two choices of dt."""
@@ -33,7 +33,7 @@ ROUNDING = 1e-9
 """Tolerance in the number of substeps, below which no additional one is computed."""
 
 
-class Arrival(NamedTuple):
+class RolloutToResult(NamedTuple):
     """Result of `rollout_to`; values per scene [B] on the device of the particles."""
 
     state: State
@@ -65,7 +65,7 @@ def rollout_to(
     most: int = MOST_SUBSTEPS,
     checkpoint: int | Checkpoints | None = None,
     previous: float | Tensor | None = None,
-) -> Arrival:
+) -> RolloutToResult:
     """Advance every scene to a given time, in substeps of its own length and number.
 
     The dt of a scene is `cfl` times the limit of `Step.stable_dt`, or slightly less, so that equal substeps end at its
@@ -109,20 +109,20 @@ def rollout_to(
     check_count("most", most, 1)
     given = _compensated(step, step.prepare(state), cfl, longest)
     unsorted = plan_call(None, facts_of(step, given, 1, 1.0)._replace(steps=most)).order > 0
-    start = put_in_order(step, given) if unsorted else given
+    start = sort_particles(step, given) if unsorted else given
     clocks = Clocks(step, start, time, cfl, longest, most, previous)
     with control_step(step, start, most, PACE, clocks.seconds) as left:
-        while (counts := clocks.look()) and counts[-1] > every:
+        while (counts := clocks.remaining()) and counts[-1] > every:
             clocks.advance(min((counts[-1] - 1) // every, MOST_SEGMENTS), every, checkpoint)
         clocks.finish(counts, checkpoint)
         arrival = clocks.arrival()
         arrival = arrival._replace(state=left(arrival.state))
-    return arrival._replace(state=put_back(step, arrival.state, start, given)) if unsorted else arrival
+    return arrival._replace(state=restore_order(step, arrival.state, start, given)) if unsorted else arrival
 
 
 def _compensated(step: Step, state: State, cfl: float, longest: float) -> State:
-    """State with the residual of positions where the first substeps need it; waits for the device, as `Clocks.look`
-    does.
+    """State with the residual of positions where the first substeps need it; waits for the device, as
+    `Clocks.remaining` does.
     """
     if step.compensated is None and state.x_residual is None:
         limit = step.stable_dt(state, cfl)
@@ -161,7 +161,7 @@ class Clocks:
         self._left = torch.zeros_like(self.substeps)  # Substeps until the end, at most `most`.
 
     @torch.no_grad()
-    def look(self) -> list[int]:
+    def remaining(self) -> list[int]:
         """Distinct numbers of remaining substeps of the scenes, in ascending order; waits for the device."""
         self.state = self._at_its_time(self.state)
         self._choose(self.state)
@@ -184,7 +184,7 @@ class Clocks:
         self.state = replay_all(self.step, segment, segment(self.state), segments - 1, max(CHUNK // n, 1))
 
     def finish(self, counts: list[int], checkpoint: int | Checkpoints | None) -> None:
-        """Last substeps of each scene, as counted by `look`."""
+        """Last substeps of each scene, as counted by `remaining`."""
         taken = 0
         for count in counts:
             dt = torch.where(self._left >= count, self._dt, 0.0).to(self.state.x.dtype)
@@ -193,7 +193,7 @@ class Clocks:
         self._take(self._left)
 
     def _plan_of_replays(self, n: int) -> RolloutPlan | None:
-        """The plan of a segment that is replayed as a CUDA graph; None where it cannot be."""
+        """The plan of a segment that is replayed as a CUDA graph; None if it cannot be recorded."""
         step, state = self.step, self.state
         if not state.x.is_cuda or follows_paths(step):
             return None
@@ -220,13 +220,13 @@ class Clocks:
         self.substeps += count
 
     @torch.no_grad()
-    def arrival(self) -> Arrival:
+    def arrival(self) -> RolloutToResult:
         state = self._at_its_time(self.state)
         self._limit(state)
         arrived = self.now >= self.end
         if not isinstance(self._end, Tensor) and bool((self.now == self.end).all()):
             state = state.replace(time=float(self._end))
-        return Arrival(state, arrived, self.substeps, self.largest_cfl, self._bound)
+        return RolloutToResult(state, arrived, self.substeps, self.largest_cfl, self._bound)
 
     def _at_its_time(self, state: State) -> State:
         return state.replace(time=self.now.clone())

@@ -194,7 +194,7 @@ def _item_problems(key: str, item: Any, scene: Any) -> list[str]:
             obstacle(item, None).pose(0.0)
             return []
         if isinstance(item, schema.PointsBody) and item.particles is not None:
-            return [f"{key}.particles: the particles of {item.file} are those of the file; leave it out"]
+            return [f"{key}.particles: the particles of {item.file} are those of the file; remove the key"]
         shape = region(item, None)
         return [] if shape is None else list(bounds_problems(key, item, shape, scene.grid))
     except (ValueError, TypeError) as error:

@@ -115,7 +115,7 @@ def _advice(quantity: str, dt: float, limit: float) -> str:
     if dt > limit:
         return (
             f"Likely cause: the time step {dt:.3g} s is above the stability limit {limit:.3g} s; "
-            f"use dt = {0.5 * limit:.2g}, or leave dt out and set cfl = 0.5."
+            f"use dt = {0.5 * limit:.2g}, or remove dt and set cfl = 0.5."
         )
     if "left the domain" in quantity:
         return (

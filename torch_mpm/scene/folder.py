@@ -111,7 +111,7 @@ def prepare(folder: Path, scene: Scene, layout: Layout, fingerprint: str) -> Non
         if layout.bytes > free:
             raise OutputError(
                 f"the trajectory needs {in_words(layout.bytes)} in {folder}, where {in_words(free)} are free; "
-                "free some space, lower fps or leave out output.fields"
+                "free some space, lower fps or remove output.fields"
             )
         create(folder / PARTIAL, layout)
 

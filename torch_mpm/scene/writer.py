@@ -121,7 +121,7 @@ class FrameWriter:
         self.waited += time.perf_counter() - begin
 
     def close(self, finished: bool = False) -> None:
-        """Wait for all frames and close the trajectory; `finished` where no checkpoint is needed any more.
+        """Wait for all frames and close the trajectory; `finished` if no checkpoint is needed.
 
         Raises:
             OSError: an error of a frame.

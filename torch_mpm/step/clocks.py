@@ -51,7 +51,7 @@ class StepTimes(NamedTuple):
     tensor: Tensor
     """Times [n] or, where scenes have separate clocks, [n, B], in float64."""
     numbers: list[float] | None
-    """Times as numbers where all scenes have one time, which the host knows."""
+    """Times as numbers on the host, if all scenes have the same time; otherwise None."""
 
     @classmethod
     @torch.no_grad()
@@ -68,7 +68,7 @@ class StepTimes(NamedTuple):
         return cls(torch.stack(times), None)
 
     def within(self, start: float, end: float) -> slice:
-        """Steps that begin in [start, end), where the host knows; otherwise all."""
+        """Steps that begin in [start, end), if the times are numbers on the host; otherwise all."""
         if self.numbers is None:
             return slice(0, len(self.tensor))
         return slice(bisect_left(self.numbers, start), bisect_left(self.numbers, end))

@@ -1,6 +1,6 @@
 """Times of calls of a solver, for calls that `torch.utils.checkpoint` recomputes in the backward pass.
 
-A solver that counts its own time cannot know the time of the first call in a recomputed one. A recomputed call gets the
+A solver that counts its own time has no time for the first recomputed call. A recomputed call gets the
 same tensors, or tensors that share their storage, so the time is stored by storage. Within a recomputed function of
 several calls, the result of one call has the time of the next.
 """

@@ -109,7 +109,7 @@ class MPMInitData:
     Attributes:
         rho: density [kg/m³].
         clip_bound: see `MPMStatics`.
-        span: first step in which it is there, and the first in which it is not any more.
+        span: first step of its presence, and first step after it.
         num_particles: P
         vol: volume of a particle [m³].
         pos: positions [P, 3] [m].
