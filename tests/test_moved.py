@@ -24,17 +24,16 @@ def test_old_import_paths(old, monkeypatch):
         module.no_such_thing  # noqa: B018
 
 
-<<<<<<< HEAD
 def test_removed_modules():
     message = r"torch_mpm.reference is not part of the package: .* `oracle` in tests/"
     with pytest.raises(ModuleNotFoundError, match=message):
         importlib.import_module("torch_mpm.reference.transfer")
-=======
+
+
 @pytest.mark.parametrize("old", RENAMED)
 def test_old_names(old):
     with pytest.warns(DeprecationWarning, match=f"torch_mpm.{old} is now torch_mpm.{RENAMED[old]}"):
         assert getattr(mpm, old) is getattr(mpm, RENAMED[old])
->>>>>>> 25f37e6 (Names of graphed steps, results of rollout_to and sorting are those of the field; plainer sentences in rollouts, fuzz programs and tests)
 
 
 def test_an_attribute_of_the_package(monkeypatch):
