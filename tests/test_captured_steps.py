@@ -588,7 +588,7 @@ def test_obstacles(device, recorded):
 
     assert why(step, state, DT).startswith("rollout(graph=...)")
     assert why(lambda state, dt: state, state, DT) == "it is no module"
-    assert why(step, state, torch.tensor(DT)) == "dt is a tensor"
+    assert why(step, state, torch.tensor(DT, device=device)) == "dt is a tensor"
     with torch.autograd.detect_anomaly():
         assert "anomaly" in why(step, state, DT)
     slow = mpm.Step(box(2), mpm.NeoHookean(E=1e4, nu=0.3), integrator="implicit")

@@ -208,7 +208,7 @@ def test_a_plan_is_a_value(device):
         assert text == str(plan) and f"all steps in one op (executor fused, schedule {plan.schedule})\n" in text
         assert all(f"not {name}: {reason}" in text for name, reason in plan.reasons.items())
         end = mpm.rollout(step, state, 20, DT, plan=plan)
-        assert torch.equal(end.x, mpm.rollout(step, state, 20, DT).x)
+        torch.testing.assert_close(end.x, mpm.rollout(step, state, 20, DT).x)  # Sums of atomics differ by rounding.
         assert SCHEDULES[torch.ops.torch_mpm.latest_schedule(state.x)] == plan.schedule
 
 

@@ -22,10 +22,10 @@ import h5py
 from torch_mpm import SimulationError, State, Trajectory
 from torch_mpm.scene import Scene, folder, heap, writer
 from torch_mpm.scene import run as module
-from torch_mpm.scene.checkpoint import load
 from torch_mpm.scene.diagnose import SceneFailure, replay
 from torch_mpm.scene.folder import OutputError
 from torch_mpm.scene.run import Interrupted
+from torch_mpm.state.state_file import load
 
 PRECISE = {"precision": "float64", "device": "cpu"}
 
@@ -180,7 +180,7 @@ def test_a_disk_too_small_is_noticed_first(tmp_path, monkeypatch):
 def test_a_disk_that_fills_up_leaves_whole_frames(tmp_path, monkeypatch):
     _, whole, _ = simulate(tmp_path / "whole")
     scene = Scene(**disc(device="cpu"))
-    save, calls = module.checkpoint.save, []
+    save, calls = module.state_file.save, []
 
     def full(path, *arguments):
         calls.append(path)
@@ -189,7 +189,7 @@ def test_a_disk_that_fills_up_leaves_whole_frames(tmp_path, monkeypatch):
         save(path, *arguments)
 
     monkeypatch.setattr(writer, "CHECKPOINT_SECONDS", 0.0)
-    monkeypatch.setattr(module.checkpoint, "save", full)
+    monkeypatch.setattr(module.state_file, "save", full)
     with pytest.raises(OutputError, match=r"no room on the disk .*No space left.* frames written so far are complete"):
         scene.run(tmp_path / "out")
     monkeypatch.undo()

@@ -305,7 +305,7 @@ class Environments:
 
     def save(self, path: str | Path, k: int | None = None) -> None:
         """Write all scenes, or scene k only, to an HDF5 file with checksums; needs h5py."""
-        from ..scene.checkpoint import save, tensors_of
+        from ..state.state_file import save, tensors_of
 
         if k is None:
             clocks = {"time": self.time, f"extra.{FROZEN}": self.frozen.int().repeat_interleave(self.room)}
@@ -323,7 +323,7 @@ class Environments:
             DamagedFileError: for a file that is damaged or holds something else.
             ValueError: for another number of particles or other fields.
         """
-        from ..scene.checkpoint import load
+        from ..state.state_file import load
 
         state, _ = load(Path(path), self.time.device, "save the environments anew")
         frozen = state.extra.pop(FROZEN, None)

@@ -451,8 +451,9 @@ def facts_of(step: Step, state: State, n: int, dt: float | Tensor, stores_all: b
 def _is_uniform(law: Any) -> bool:
     """Whether each parameter of a compiled law has one value for all particles."""
     part = passive(law)
-    values = part.values() if isinstance(part, CompiledLaw) else [part.forward]
-    return all(v.numel() == 1 if isinstance(v, Tensor) else not callable(v) for v in values)
+    if not isinstance(part, CompiledLaw) or part.has_functions:
+        return False
+    return all(v.numel() == 1 for v in part.values() if isinstance(v, Tensor))
 
 
 def _path_bytes(step: Step, state: State, dt: float | Tensor) -> int:

@@ -22,9 +22,10 @@ from ..errors import DamagedFileError, SimulationError
 from ..grid.topology import Status
 from ..laws import Mixture
 from ..rollouts import rollout
+from ..state import state_file
 from ..state.state import State, _take_all
 from ..step.stability import Figures
-from . import checkpoint, fields, heap
+from . import fields, heap
 from .build import Built
 from .diagnose import SceneFailure, replay, wrong
 from .folder import CHECKPOINT, LAST_GOOD, claim, finished, locked, output_errors, prepare, record_summary
@@ -227,7 +228,7 @@ class Simulation:
         self.fingerprint = str(layout.attributes["fingerprint"])
         with Trajectory(folder / PARTIAL) as trajectory:
             if not layout.describes(trajectory):
-                raise DamagedFileError(trajectory.path, "is the trajectory of another scene", checkpoint.REMEDY)
+                raise DamagedFileError(trajectory.path, "is the trajectory of another scene", state_file.REMEDY)
             if path.exists():
                 self._restore(path, layout, len(trajectory))
             trajectory.verify(self.frame + 1)
@@ -237,10 +238,10 @@ class Simulation:
 
     def _restore(self, path: Path, layout: Layout, written: int) -> None:
         """Load a checkpoint beside a trajectory of ``written`` frames."""
-        state, record = checkpoint.load(path, self.state.x.device)
+        state, record = state_file.load(path, self.state.x.device)
         problem = self._unfit(state, record, layout, written)
         if problem:
-            raise DamagedFileError(path, problem, checkpoint.REMEDY)
+            raise DamagedFileError(path, problem, state_file.REMEDY)
         self.state, self.frame, self.emitted = state, record["frame"], record["emitted"]
         self.totals = Totals(**record["totals"])
 
@@ -258,7 +259,7 @@ class Simulation:
         if type(emitted) is not int or not 0 <= emitted <= len(self.emissions):
             return f"has {emitted} layers of {len(self.emissions)} from the emitters"
         count = len(self.state) + sum(len(self.built.nozzles[k].layer) for _, k in self.emissions[:emitted])
-        fields = set(checkpoint.tensors_of(self.state)) - set(checkpoint.tensors_of(state))
+        fields = set(state_file.tensors_of(self.state)) - set(state_file.tensors_of(state))
         if fields or len(state) != count or state.x.dtype != self.state.x.dtype:
             return f"has not the {count} particles of this run with all their fields"
         ids = state.ids.cpu() if state.ids is not None else torch.empty(0)
@@ -336,7 +337,7 @@ class Simulation:
             "fingerprint": self.fingerprint,
             "totals": dict(vars(self.totals)),
         }
-        return Frame(self.frame, copies, scalars, checkpoint.tensors_of(state), record)
+        return Frame(self.frame, copies, scalars, state_file.tensors_of(state), record)
 
     def _show(self, state: State, figures: Figures) -> tuple[Copies, dict[str, Tensor]]:
         """Copies and sums of a state for the next frame, without waiting for them."""
@@ -566,7 +567,7 @@ def _save_last_good(folder: Path, state: State, failure: SceneFailure) -> str:
     path = folder / LAST_GOOD
     record = {"time": float(state.time), "failure": str(failure)}
     try:
-        checkpoint.save(path, {k: v.cpu() for k, v in checkpoint.tensors_of(state).items()}, record)
+        state_file.save(path, {k: v.cpu() for k, v in state_file.tensors_of(state).items()}, record)
     except OSError as error:
         return f"The last good state could not be stored: {error.strerror or error}."
     return f"The state before it is in {path}."

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from ..data.trajectory import TrajectoryWriter
-from . import checkpoint
+from ..state import state_file
 
 CHECKPOINT_SECONDS = 1.0
 """Minimum time between two checkpoints [s]: the work that a killed run may have to recompute."""
@@ -169,5 +169,5 @@ class FrameWriter:
 
     def _save(self, frame: Frame) -> None:
         with contextlib.suppress(torch.AcceleratorError):  # Its state is lost, and the run fails with it.
-            checkpoint.save(self.checkpoint_path, _copied(frame.state), frame.record)
+            state_file.save(self.checkpoint_path, _copied(frame.state), frame.record)
         self._saved, self._unsaved = time.perf_counter(), None

@@ -15,7 +15,7 @@ from torch import Tensor
 from ..data.hdf5 import h5py_module, open_sealed, seal
 from ..data.whole_files import building_path
 from ..errors import DamagedFileError
-from ..state.state import State, _as_soa
+from .state import State, _as_soa
 
 Host = dict[str, Tensor]
 REMEDY = "remove it and add --resume to simulate from the start"
