@@ -173,3 +173,48 @@ def test_a_time_of_an_earlier_version_is_read(tmp_path):
     read = torch.load(tmp_path / "state.pt", weights_only=True)
     assert read.time.dtype == torch.float64 and read.time.tolist() == torch.tensor([0.1, 0.2]).double().tolist()
     assert mpm.State.concatenate([read.replace(time=0.25)]).time == 0.25
+
+
+WRONG = {
+    "v": lambda s: s.v[1:],
+    "mass": lambda s: s.mass[1:],
+    "volume": lambda s: s.volume.float(),
+    "C": lambda s: s.x.new_zeros(len(s), 3, 3),
+    "F": lambda s: s.x.new_zeros(len(s) - 1, 2, 2),
+    "J": lambda s: s.mass[1:],
+    "scene": lambda s: torch.zeros(len(s) - 1, dtype=torch.int32),
+    "ids": lambda s: torch.arange(len(s) - 1),
+    "material": lambda s: torch.zeros(len(s)),
+    "temperature": lambda s: s.mass[1:],
+    "extra": lambda s: {"history": s.mass[1:]},
+    "impulse": lambda s: s.mass.new_zeros(3),
+    "x_residual": lambda s: s.x[1:],
+}
+"""A field that does not fit its state."""
+
+
+@pytest.mark.parametrize("way", ["replace", "step", "rollout"])
+@pytest.mark.parametrize("name", WRONG)
+def test_fields_that_do_not_fit_are_errors(name, way):
+    """Also where a field is assigned, and no op reads it."""
+    step, state = mpm.Step(grid(), mpm.NeoHookean(E=1e4, nu=0.3)), block(5)
+    wrong = WRONG[name](state)
+    with pytest.raises((TypeError, ValueError, RuntimeError), match=name.removeprefix("x_")):
+        if way == "replace":
+            state.replace(**{name: wrong})
+        setattr(state, name, wrong)
+        step(state, 1e-4) if way == "step" else mpm.rollout(step, state, 2, 1e-4)
+
+
+def test_fields_that_do_not_exist_are_errors():
+    with pytest.raises(TypeError, match="velocity"):
+        block(5).replace(velocity=None)
+
+
+def test_copies_share_nothing_that_is_replaced():
+    state = block(5).replace(extra={"history": torch.zeros(5)})
+    changed = state.replace(time=0.5, extra={}, v=state.v + 1)
+    assert changed.time == 0.5 and state.time == 0 and set(state.extra) == {"history"} and changed.extra == {}
+    assert changed.x is state.x and not torch.equal(changed.v, state.v)
+    with pytest.raises(ValueError, match="v must have shape"):
+        state.replace(x=state.x[1:])

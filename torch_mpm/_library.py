@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import functools
 import json
 import os
 from pathlib import Path
@@ -60,7 +61,13 @@ def _load_cuda() -> str | None:
 
 def graph_loops() -> bool:
     """Whether the device is not known to refuse CUDA graphs with loops; also where the CUDA library is not in use."""
-    return cuda_error is not None or bool(ctypes.CDLL(os.fspath(CUDA_LIBRARY)).torch_mpm_graph_loops())
+    return cuda_error is not None or bool(_opened(CUDA_LIBRARY).torch_mpm_graph_loops())
+
+
+@functools.cache
+def _opened(library: Path) -> ctypes.CDLL:
+    """A library whose functions are called without torch; opening it looks for its file each time."""
+    return ctypes.CDLL(os.fspath(library))
 
 
 _load_cpu()

@@ -242,7 +242,7 @@ class Grid(Lattice):
             and self._pending.query()
         ):
             assert self._on_host is not None
-            wanted = self._on_host.tolist()[7]
+            wanted = self._on_host.tolist()[Status.BLOCKS_NOW]
             if wanted * 4 > self.max_blocks * 3:
                 self.max_blocks = min(_with_headroom(wanted), self._most_blocks)
             self._pending = None

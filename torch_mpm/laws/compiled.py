@@ -44,8 +44,8 @@ PLASTIC_VOLUME = "log_plastic_volume"
 """History of laws whose plastic flow changes the volume: ln J_p."""
 ARGUMENTS = {"eta": "viscosity"}
 """Names of arguments that are stored under another name."""
-_OF_MODULES = frozenset(vars(nn.Module()))
-"""Attributes that every module has; none becomes a parameter."""
+_NO_VALUES = frozenset({type(value) for value in vars(nn.Module()).values()} | {GraphCache, str})
+"""Types of attributes that are no parameters, such as those that every module has."""
 FIGURES = ("stress", "stiffness", "energy_density")
 """Values of a law that a survey needs."""
 
@@ -297,21 +297,18 @@ class CompiledLaw(Material):
         return deformation, parameters
 
     def check_parameters(self, particles: int, scenes: int | None) -> None:
-        for name, value in self._stored().items():
+        for name, value in self._stored():
             if isinstance(value, (Tensor, PerMaterial)):
                 check_length(ARGUMENTS.get(name, name), value, particles, scenes)
 
-    def _stored(self) -> dict[str, Any]:
-        """All attributes, by the names under which parameters are stored; in compiled code only registered ones, since
-        compilers of torch 2.11 do not support the others.
+    def _stored(self) -> list[tuple[str, Any]]:
+        """Attributes that may be parameters, by the names under which they are stored; in compiled code only registered
+        ones, since compilers of torch 2.11 do not support the others.
         """
-        registered: dict[str, Any] = {}
-        for kept in (self._parameters, self._buffers, self._modules):
-            for name, value in kept.items():
-                registered[name] = value
+        registered = [*self._parameters.items(), *self._buffers.items(), *self._modules.items()]
         if torch.compiler.is_compiling():
             return registered
-        return {**{name: value for name, value in vars(self).items() if name not in _OF_MODULES}, **registered}
+        return [*registered, *((name, value) for name, value in vars(self).items() if type(value) not in _NO_VALUES)]
 
     def _parameters_of(self, state: State) -> list[Tensor]:
         """Parameters in the dtype, on the device and in the particle order of the state.
@@ -321,7 +318,7 @@ class CompiledLaw(Material):
         if self._functions:
             in_order: Any = Overlay(state, ids=None)  # Evaluated parameters have this form already.
             return self._at_temperature(state)._convert(in_order)
-        stored = self._stored().values()
+        stored = [value for _, value in self._stored()]
         tensors = [value for value in stored if isinstance(value, Tensor)]
         x, order = state.x, None
         particles = getattr(state, "particles", x.shape[0])
@@ -339,7 +336,7 @@ class CompiledLaw(Material):
         """The law with its parameters at the temperature of each particle, in the order of the state."""
         law: CompiledLaw = object.__new__(type(self))
         law.__dict__ = {**self.__dict__, "_parameters": {}, "_buffers": {}, "_modules": {}}
-        for name, value in self._stored().items():
+        for name, value in self._stored():
             if isinstance(value, Tensor) or (callable(value) and not name.startswith("_")):
                 law.__dict__[name] = evaluate(ARGUMENTS.get(name, name), value, state)
         return law

@@ -169,7 +169,7 @@ def _substeps(
     record.follow(record.status, status)
     grid.watch(status)
     if status.device.type == "cpu":  # where the op has let the pool grow, or stopped
-        grid.follow(int(status[0, Status.BLOCKS_WANTED if grid.grows else Status.BLOCKS_NOW]))
+        grid.follow(status[0].tolist()[Status.BLOCKS_WANTED if grid.grows else Status.BLOCKS_NOW])
     extra = _history(state, history_names, history)
     now = time_after(state.time, dt, n) if time is None else _in_shape(time.detach(), state.time, dt)
     if requires_grad(dt) or requires_grad(state.time):

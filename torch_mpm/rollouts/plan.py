@@ -261,19 +261,26 @@ def _fused(
     step: Step, state: State, n: int, dt: float | Tensor, checkpoints: Checkpoints | None, schedule: str | None
 ) -> RolloutPlan:
     facts = facts_of(step, state, n, dt, checkpoints is EVERYTHING)
+    plan = _planned(schedule, facts)
+    if checkpoints is None and not facts.gradients:
+        return plan
+    steps = plan.steps_per_call
+    if facts.gradients and checkpoints is not EVERYTHING:
+        every = None if checkpoints is None else checkpoints.every
+        steps = min(steps, every or steps_of_a_call(state, n))
+    return dataclasses.replace(plan, steps_per_call=steps, checkpoints=checkpoints)
+
+
+@functools.lru_cache(maxsize=1024)
+def _planned(schedule: str | None, facts: Facts) -> RolloutPlan:
+    """The plan for facts, without gradients."""
     try:
         call = plan_call(schedule, facts)
     except RuntimeError as error:
         raise ValueError(str(error).partition("\n")[0]) from None
-    steps = call.steps
-    if facts.gradients and checkpoints is not EVERYTHING:
-        every = None if checkpoints is None else checkpoints.every
-        steps = min(steps, every or steps_of_a_call(state, n))
     reasons = {**_INSTEAD, **dict(call.reasons)}
-    forced = schedule is not None
-    return RolloutPlan(
-        "fused", call.schedule, steps, call.max_blocks, call.order == 1, checkpoints, reasons, forced, facts
-    )
+    sorts, forced = call.order == 1, schedule is not None
+    return RolloutPlan("fused", call.schedule, call.steps, call.max_blocks, sorts, None, reasons, forced, facts)
 
 
 # ---- why not

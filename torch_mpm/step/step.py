@@ -247,6 +247,7 @@ class Step(TensorModule):
     def prepare(self, state: State) -> State:
         """Give a state the fields that this step needs and that it lacks."""
         check_state(state)
+        state.check_assigned()
         law = self.law
         changes: dict[str, Any] = {}
         if "F" in law.state_fields and state.F is None:
