@@ -9,62 +9,43 @@ import torch
 from torch import Tensor
 
 import torch_mpm as mpm
+from benchmarks.catalogue import laws as catalogue
 
 DX = 0.125
 DT = 2e-3
 """[s]; a tenth of the limit of the stiffest law at rest."""
 F64 = torch.float64
 
-SOLID = {"E": 1e4, "nu": 0.3}
 SAND_ENERGIES = ("unilateral", "full", "hencky", "mixed")
 
 
-def _neo_hookean_stress(F: Tensor) -> Tensor:
-    J = torch.linalg.det(F)[:, None, None]
-    return 4e3 * (F @ F.mT - torch.eye(F.shape[1], dtype=F.dtype, device=F.device)) + 3e3 * J.log() * torch.eye(
-        F.shape[1], dtype=F.dtype, device=F.device
-    )
-
-
-def _hencky_stress(sigma: Tensor) -> Tensor:
-    h = sigma.log()
-    return 8e3 * h + 3e3 * h.sum(1, keepdim=True)
-
-
-def _sand(r: random.Random) -> mpm.Material:
+def _sand(r: random.Random) -> dict[str, Any]:
     energy = r.choice(SAND_ENERGIES)
     hardening = r.random() < 0.3
-    return mpm.QuarticSand(
-        **SOLID,
-        friction_angle=None if hardening else r.uniform(0.3, 0.9),
-        energy=energy,
-        apex=r.choice(("zero", "keep")) if energy == "unilateral" else "zero",
-        flow=r.choice(("radial", "exact")),
-        cohesion=r.choice((None, r.uniform(0.0, 0.05))),
-        volume_correction=r.random() < 0.5,
-        hardening=(0.61, 0.16, 0.2, 0.17) if hardening else None,
-    )
+    return {
+        "friction_angle": None if hardening else r.uniform(0.3, 0.9),
+        "energy": energy,
+        "apex": r.choice(("zero", "keep")) if energy == "unilateral" else "zero",
+        "flow": r.choice(("radial", "exact")),
+        "cohesion": r.choice((None, r.uniform(0.0, 0.05))),
+        "volume_correction": r.random() < 0.5,
+        "hardening": (0.61, 0.16, 0.2, 0.17) if hardening else None,
+    }
 
 
-LAWS: dict[str, Callable[[random.Random], mpm.Material]] = {
-    "neo_hookean": lambda r: mpm.NeoHookean(**SOLID),
-    "fluid": lambda r: mpm.WeaklyCompressible(1e4, gamma=r.choice((1.0, 7.0))),
-    "viscous_fluid": lambda r: mpm.WeaklyCompressible(1e4, viscosity=r.uniform(0.1, 10.0)),
-    "fixed_corotated": lambda r: mpm.FixedCorotated(**SOLID),
-    "hencky": lambda r: mpm.Hencky(**SOLID),
-    "von_mises": lambda r: mpm.VonMises(**SOLID, yield_stress=300.0, hardening=r.choice((0.0, 2e3))),
-    "herschel_bulkley": lambda r: mpm.HerschelBulkley(**SOLID, yield_stress=100.0, consistency=5.0, exponent=0.7),
-    "snow": lambda r: mpm.Snow(**SOLID),
-    "cam_clay": lambda r: mpm.CamClay(**SOLID, critical_slope=1.2, consolidation=500.0, hardening=8.0, cohesion=0.1),
+LAWS = catalogue.LAWS | catalogue.named("water")
+OPTIONS: dict[str, Callable[..., dict[str, Any]]] = {
+    "water": lambda r: {"gamma": r.choice((1.0, 7.0))},
+    "fluid": lambda r: {"viscosity": r.uniform(0.1, 10.0)},
+    "von_mises": lambda r: {"hardening": r.choice((0.0, 2e3))},
     "sand": _sand,
-    "custom": lambda r: mpm.CustomLaw(_neo_hookean_stress, stiffness=3e4),
-    "custom_principal": lambda r: mpm.CustomPrincipalLaw(_hencky_stress, stiffness=3e4),
-    "mixture": lambda r: mpm.Mixture([mpm.NeoHookean(**SOLID), _sand(r), mpm.WeaklyCompressible(1e4)]),
-    "expansion": lambda r: mpm.ThermalExpansion(mpm.NeoHookean(**SOLID), 1e-4),
-    "melting": lambda r: mpm.Melting(mpm.FixedCorotated(**SOLID), mpm.WeaklyCompressible(1e4)),
+    "mixture": _sand,
+    "custom": lambda r: {"stiffness": 3e4},
+    "custom_principal": lambda r: {"stiffness": 3e4},
 }
+"""Draws of arguments of laws; the others are those of the catalogue."""
 PLASTIC = ("von_mises", "herschel_bulkley", "sand", "mixture")
-WITH_ENERGY = (*PLASTIC, "neo_hookean", "fluid", "viscous_fluid", "fixed_corotated", "hencky")
+WITH_ENERGY = (*PLASTIC, "neo_hookean", "fluid", "water", "fixed_corotated", "hencky")
 """Laws whose free energy is `energy_density`: hardening of snow and clay changes their moduli or stores more."""
 
 
@@ -142,8 +123,11 @@ def make(c: Combination, device: str = "cpu", swap: bool = False, scene: int | N
         scene: this scene of the batch alone.
     """
     r = random.Random(c.seed + 1000)
-    law = LAWS[c.law](r)
     axes = [1, 0, 2][: c.dim] if swap else list(range(c.dim))
+    options = OPTIONS[c.law](r) if c.law in OPTIONS else {}
+    if c.law == "active":
+        options["direction"] = [(0.6, 0.8, 0.0)[axis] for axis in axes]
+    law = LAWS[c.law](strength=0.03, **options)
     state = _state(c)
     parameters = {name: value.to(device) for name, value in _per_particle(c, len(state)).items()}
     if scene is not None:
@@ -180,11 +164,12 @@ def _state(c: Combination) -> mpm.State:
     volume = (DX / 2) ** D * (1 + 0.2 * uniform(P))
     scene = torch.repeat_interleave(torch.arange(c.scenes), torch.tensor(sizes)).int()
     material = torch.arange(P, dtype=torch.int32) % 3 if c.law == "mixture" else None
+    extra = {"activation": 1e3 * uniform(P)} if c.law == "active" else {}
     temperature = uniform(P) if c.heat is not None or c.law == "expansion" else None
     return mpm.State(
         x=0.75 + 0.2 * uniform(P, D), v=0.5 * uniform(P, D), mass=1000.0 * volume * (1 + 0.2 * uniform(P)),
         volume=volume, C=uniform(P, D, D) if c.transfer == "apic" else None, F=F, J=torch.linalg.det(F),
-        scene=None if c.scenes == 1 else scene, material=material, temperature=temperature,
+        scene=None if c.scenes == 1 else scene, material=material, temperature=temperature, extra=extra,
     )  # fmt: skip
 
 

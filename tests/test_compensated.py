@@ -7,6 +7,7 @@ import torch
 from helpers import relative_error
 
 import torch_mpm as mpm
+from benchmarks.catalogue.laws import named
 from torch_mpm.ops.g2p_advance import g2p_advance_compensated
 
 F32, F64 = torch.float32, torch.float64
@@ -107,12 +108,7 @@ def test_without_compensation_it_does_not_move_and_that_is_reported(device):
 # ---- residuals stay with their particles
 
 
-LAWS = {
-    "solid": lambda: mpm.NeoHookean(E=1e5, nu=0.3),
-    "fluid": lambda: mpm.WeaklyCompressible(1e5, viscosity=1.0),
-    "plastic": lambda: mpm.QuarticSand(E=1e5, nu=0.3, friction_angle=0.5),
-    "mixture": lambda: mpm.Mixture([mpm.NeoHookean(E=1e5, nu=0.3), mpm.QuarticSand(E=1e5, nu=0.3)]),
-}
+LAWS = named("neo_hookean", "fluid", "sand", "mixture")
 
 
 @pytest.mark.parametrize("scenes", [1, 3])
@@ -120,7 +116,7 @@ LAWS = {
 @pytest.mark.parametrize("count", [3000, 2**18 + 64])
 def test_residuals_stay_with_their_particles(count, law, scenes, dim, device):
     """At rest they do not change, wherever rollouts put particles in memory meanwhile, and in sorted states."""
-    if count > 3000 and (device == "cpu" or law != "solid" or scenes > 1):
+    if count > 3000 and (device == "cpu" or law != "neo_hookean" or scenes > 1):
         pytest.skip("of calls that own their particles on CUDA")
     generator = torch.Generator().manual_seed(1)
     grid = mpm.Grid(1 / 32, (0.0,) * dim, (1.0,) * dim, scenes=scenes)
@@ -173,7 +169,7 @@ def test_paused_scenes_keep_their_residual(dim):
 
 
 @pytest.mark.parametrize("way", ["rollout", "checkpoint", "memory", "steps"])
-@pytest.mark.parametrize("law", ["solid", "fluid", "plastic"])
+@pytest.mark.parametrize("law", ["neo_hookean", "fluid", "sand"])
 def test_gradients_are_those_without_compensation(way, law, dim, device):
     """To rounding in float64, for recorded and for recomputed steps."""
     n, kept = 12, {"checkpoint": 4, "memory": mpm.Checkpoints(memory=1e9)}.get(way)

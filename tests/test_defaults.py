@@ -14,6 +14,7 @@ from helpers import disc
 from torch import Tensor
 
 import torch_mpm as mpm
+from benchmarks.catalogue.laws import named
 from torch_mpm import heat_boundaries
 
 DEFAULTS = ["meta", "context", pytest.param("cuda", marks=pytest.mark.cuda), "float64", "float16"]
@@ -60,16 +61,8 @@ def obstacles(dim: int, device: str) -> list:
 
 
 def laws() -> list[mpm.Material]:
-    elastic = {"E": 1e4, "nu": 0.3}
-    return [
-        mpm.NeoHookean(**elastic),
-        mpm.WeaklyCompressible(1e4, viscosity=0.1),
-        mpm.QuarticSand(**elastic, volume_correction=True, hardening=(0.6, 0.1, 0.2, 0.1)),
-        mpm.VonMises(**elastic, yield_stress=100.0),
-        mpm.HerschelBulkley(**elastic, yield_stress=1.0, consistency=1.0),
-        mpm.CustomLaw(lambda F: 1e4 * (F @ F.mT - torch.eye(F.shape[1], dtype=F.dtype, device=F.device))),
-        mpm.CustomPrincipalLaw(lambda sigma: 1e4 * (sigma - 1)),
-    ]
+    names = ("neo_hookean", "fluid", "sand_hardening", "von_mises", "herschel_bulkley", "custom", "custom_principal")
+    return [law() for law in named(*names).values()]
 
 
 def simulate(dim: int, device: str) -> list[Tensor]:

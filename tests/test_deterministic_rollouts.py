@@ -50,7 +50,7 @@ def test_crowded_blocks(high, dim, device):
 
 
 @pytest.mark.parametrize(
-    ("law", "cells"), [("neo_hookean", 0.15), ("neo_hookean", 0.6), ("sand", 0.15), ("fluid", 0.15)]
+    ("law", "cells"), [("neo_hookean", 0.15), ("neo_hookean", 0.6), ("sand", 0.15), ("water", 0.15)]
 )
 def test_many_particles(law, cells, dim, device):
     state = many.body(dim, device, cells)
@@ -63,7 +63,7 @@ def test_many_particles(law, cells, dim, device):
 def test_a_mixture_beside_an_obstacle(transfer, kernel, dim, device):
     state = few.body(dim, device)
     material = (state.x[:, 0] > state.x[:, 0].mean()).int()
-    laws = mpm.Mixture([LAWS["neo_hookean"](), LAWS["fluid"]()])
+    laws = mpm.Mixture([LAWS["neo_hookean"](), LAWS["water"]()])
     ball = mpm.Sphere((0.6, 0.2, 0.5)[:dim], 0.2, friction=0.3, velocity=(-2.0, 1.0, 0.0)[:dim])
     step = make(dim, laws, boundaries=[ball], grid={"kernel": kernel}, **TRANSFERS[transfer])
     assert_repeats(step, state.replace(material=material), N, DT, 1e-3)
@@ -81,7 +81,7 @@ def test_masses_of_many_sizes(dim, device):
     share = 10 ** torch.linspace(-6, 0, len(state), dtype=F64, device=device)
     share[3] = 0.0
     mass, volume = state.mass * share, state.volume * share
-    assert_repeats(make(dim, "fluid"), state.replace(mass=mass, volume=volume), N, DT, 2e-3)
+    assert_repeats(make(dim, "water"), state.replace(mass=mass, volume=volume), N, DT, 2e-3)
 
 
 @pytest.mark.parametrize("scale", [1e-20, 1e20])

@@ -68,7 +68,7 @@ def test_momentum_is_balanced(device, dim, walls, transfer):
     """And the one op has the impulses of single steps."""
     grid, in_torch = grid_of(dim, scenes=2), dim == 2 and transfer in ("pic", "blend")
     step = mpm.Step(
-        grid, LAWS["elastic"](), GRAVITY[:dim], WALLS[walls], obstacles(dim, in_torch), **TRANSFERS[transfer]
+        grid, LAWS["neo_hookean"](), GRAVITY[:dim], WALLS[walls], obstacles(dim, in_torch), **TRANSFERS[transfer]
     )
     state = step.with_impulses(step.prepare(cloud(dim, device, 2, 60)))
     with torch.no_grad():
@@ -93,7 +93,7 @@ def test_momentum_is_balanced_for_laws(device, kernel, law, form, dtype):
 
 
 def test_steps_without_impulses_are_the_same(device):
-    step = mpm.Step(grid_of(3), LAWS["elastic"](), GRAVITY, WALLS["mirror"], obstacles(3))
+    step = mpm.Step(grid_of(3), LAWS["neo_hookean"](), GRAVITY, WALLS["mirror"], obstacles(3))
     state = step.prepare(cloud(3, device))
     counting = step.with_impulses(state)
     many = 20  # on CUDA some of them are replayed
@@ -154,7 +154,7 @@ def test_more_obstacles_than_an_op_takes(device):
     many = [mpm.Sphere((0.1 + 0.04 * k, 0.3), 0.1, kind="slip", friction=0.1) for k in range(20)]
     blocks = random_blocks(grid_of(2), device)
     nodes = random_nodes(blocks)
-    step = mpm.Step(grid_of(2), LAWS["elastic"](), boundaries=many)
+    step = mpm.Step(grid_of(2), LAWS["neo_hookean"](), boundaries=many)
     state = step.with_impulses(cloud(2, device))
     end = step(state, DT)
     assert end.impulse.shape == (1, 24, 3)
@@ -252,11 +252,11 @@ def test_a_held_ball_is_lifted_by_water(device):
 
 def test_nothing_to_count(device):
     """No boundaries, no particles, an empty scene."""
-    step = mpm.Step(grid_of(2, scenes=2), LAWS["elastic"]())
+    step = mpm.Step(grid_of(2, scenes=2), LAWS["neo_hookean"]())
     state = cloud(2, device, 2).select(torch.arange(0, 240, 2).to(device))
     end = mpm.rollout(step, step.with_impulses(state), 3, DT)
     assert end.impulse.shape == (2, 4, 3) and (end.impulse == 0).all()
-    step = mpm.Step(grid_of(2, scenes=2), LAWS["elastic"](), GRAVITY[:2], "sticky", obstacles(2))
+    step = mpm.Step(grid_of(2, scenes=2), LAWS["neo_hookean"](), GRAVITY[:2], "sticky", obstacles(2))
     end = mpm.rollout(step, step.with_impulses(state), 3, DT)  # scene 1 is empty
     assert (end.impulse[1] == 0).all() and (end.impulse[0] != 0).any()
     empty = state.select(torch.empty(0, dtype=torch.int64, device=device))
@@ -265,7 +265,9 @@ def test_nothing_to_count(device):
 
 
 def test_a_lost_scene_does_not_reach_the_others(device):
-    step = mpm.Step(grid_of(2, scenes=2, deterministic=True), LAWS["elastic"](), GRAVITY[:2], "sticky", obstacles(2))
+    step = mpm.Step(
+        grid_of(2, scenes=2, deterministic=True), LAWS["neo_hookean"](), GRAVITY[:2], "sticky", obstacles(2)
+    )
     state = step.with_impulses(cloud(2, device, 2))
     broken = state.replace(v=torch.where((state.scene == 1)[:, None], torch.nan, state.v))
     for run in (lambda s: mpm.rollout(step, s, 4, DT), lambda s: one_by_one(step, s, 4)):
@@ -274,7 +276,7 @@ def test_a_lost_scene_does_not_reach_the_others(device):
 
 
 def test_a_paused_scene_counts_nothing(device):
-    step = mpm.Step(grid_of(2, scenes=2), LAWS["elastic"](), GRAVITY[:2], "sticky", obstacles(2))
+    step = mpm.Step(grid_of(2, scenes=2), LAWS["neo_hookean"](), GRAVITY[:2], "sticky", obstacles(2))
     state = step.with_impulses(cloud(2, device, 2))
     dt = torch.tensor([DT, 0.0], dtype=F64, device=device)
     end = one_by_one(step, state, 3, dt)
@@ -282,15 +284,15 @@ def test_a_paused_scene_counts_nothing(device):
 
 
 def test_results_have_the_same_bits_again(device):
-    step = mpm.Step(grid_of(3, deterministic=True, scenes=2), LAWS["elastic"](), GRAVITY, "sticky", obstacles(3))
+    step = mpm.Step(grid_of(3, deterministic=True, scenes=2), LAWS["neo_hookean"](), GRAVITY, "sticky", obstacles(3))
     state = step.with_impulses(cloud(3, device, 2, 400))
     runs = [mpm.rollout(step, state, STEPS, DT).impulse for _ in range(3)]
     assert torch.equal(runs[0], runs[1]) and torch.equal(runs[0], runs[2])
 
 
 def test_fields_of_a_state(device):
-    step = mpm.Step(grid_of(2, scenes=2), LAWS["elastic"](), boundaries=obstacles(2), walls="slip")
-    single = mpm.Step(grid_of(2), LAWS["elastic"](), boundaries=obstacles(2), walls="slip")
+    step = mpm.Step(grid_of(2, scenes=2), LAWS["neo_hookean"](), boundaries=obstacles(2), walls="slip")
+    single = mpm.Step(grid_of(2), LAWS["neo_hookean"](), boundaries=obstacles(2), walls="slip")
     parts = [mpm.rollout(single, single.with_impulses(cloud(2, device, count=n)), 3, DT) for n in (30, 50)]
     batch = mpm.State.concatenate(parts, scene=True)
     assert torch.equal(batch.impulse, torch.cat([p.impulse for p in parts]))
@@ -308,7 +310,7 @@ def test_fields_of_a_state(device):
 def test_frames_and_control(device):
     """Impulses between frames, while a hook gives the paddle new poses; forces by boundary, number and face."""
     paddle = mpm.Box(torch.tensor([0.5, 0.4], dtype=F64, device=device), (0.3, 0.1))
-    step = mpm.Step(grid_of(2), LAWS["elastic"](), GRAVITY[:2], "sticky", boundaries=[paddle])
+    step = mpm.Step(grid_of(2), LAWS["neo_hookean"](), GRAVITY[:2], "sticky", boundaries=[paddle])
     state = step.with_impulses(cloud(2, device))
 
     def control(state: mpm.State, k: int) -> None:
@@ -329,7 +331,7 @@ def test_frames_and_control(device):
 
 
 def test_errors():
-    step = mpm.Step(grid_of(2), LAWS["elastic"](), walls="slip")
+    step = mpm.Step(grid_of(2), LAWS["neo_hookean"](), walls="slip")
     state = cloud(2)
     with pytest.raises(ValueError, match=r"state\.impulse is None"):
         step.impulses(state)

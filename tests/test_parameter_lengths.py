@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 import torch_mpm as mpm
+from benchmarks.catalogue.laws import LAWS as LAWS_OF_CATALOGUE
 from torch_mpm import heat_boundaries
 from torch_mpm.geometry import seed
 from torch_mpm.ops import LAWS, law_energy, law_update
@@ -20,37 +21,19 @@ WRONG = (2, P - 1, P + 1, 64)
 """Lengths that are neither 1 nor B nor P."""
 
 SOLID = {"E": 1e4, "nu": 0.3}
-MAKES: dict[str, tuple[Callable[..., mpm.Material], dict[str, float]]] = {
-    "neo_hookean": (mpm.NeoHookean, SOLID),
-    "hencky": (mpm.Hencky, {"mu": 4e3, "lam": 6e3}),
-    "fixed_corotated": (mpm.FixedCorotated, SOLID),
-    "fluid": (mpm.WeaklyCompressible, {"bulk_modulus": 1e4, "gamma": 7.0, "viscosity": 0.1}),
-    "von_mises": (mpm.VonMises, SOLID | {"yield_stress": 30.0, "hardening": 100.0}),
-    "herschel_bulkley": (
-        mpm.HerschelBulkley, SOLID | {"yield_stress": 10.0, "consistency": 5.0, "exponent": 0.7},
-    ),
-    "viscoelastic": (mpm.Viscoelastic, SOLID | {"branch_modulus": 4e3, "relaxation_time": 0.1}),
-    "snow": (mpm.Snow, SOLID | {"critical_compression": 0.02, "critical_stretch": 0.005, "hardening": 10.0}),
-    "cam_clay": (
-        mpm.CamClay, SOLID | {"critical_slope": 1.2, "consolidation": 500.0, "hardening": 8.0, "cohesion": 0.1},
-    ),
-    "sand": (mpm.QuarticSand, SOLID | {"friction_angle": 0.5, "cohesion": 0.01}),
+TAKES_NUMBERS = {name: law for name, law in LAWS_OF_CATALOGUE.items() if not name.startswith("custom")}
+MAKES: dict[str, tuple[Callable[..., mpm.Material], dict[str, Any]]] = {
+    **{name: (law.make, law.arguments()) for name, law in TAKES_NUMBERS.items()},
+    "lame": (mpm.Hencky, {"mu": 4e3, "lam": 6e3}),
+    "water": (mpm.WeaklyCompressible, {"bulk_modulus": 1e4, "gamma": 7.0}),
+    "cohesive_sand": (mpm.QuarticSand, SOLID | {"friction_angle": 0.5, "cohesion": 0.01}),
     "hardening_sand": (
         lambda h0, h1, h2, h3, **solid: mpm.QuarticSand(**solid, hardening=(h0, h1, h2, h3)),
         SOLID | {"h0": 0.6, "h1": 0.1, "h2": 0.2, "h3": 0.1},
     ),
-    "expansion": (
-        lambda coefficient: mpm.ThermalExpansion(mpm.NeoHookean(**SOLID), coefficient), {"coefficient": 1e-3},
-    ),
-    "melting": (
-        lambda bulk_modulus: mpm.Melting(mpm.NeoHookean(**SOLID), mpm.WeaklyCompressible(bulk_modulus)),
-        {"bulk_modulus": 1e4},
-    ),
-    "active": (lambda E: mpm.Active(mpm.NeoHookean(E, 0.3), (1.0, 0.0)), {"E": 1e4}),
-    "mixture": (lambda E: mpm.Mixture([mpm.Hencky(**SOLID), mpm.NeoHookean(E, 0.3)]), {"E": 1e4}),
-}  # fmt: skip
-"""Constructor of each law, and values of its parameters."""
-PARAMETERS = [(law, name) for law, (_, given) in MAKES.items() for name in given]
+}
+"""Constructor of each law, and its arguments; numbers are parameters."""
+PARAMETERS = [(law, name) for law, (_, given) in MAKES.items() for name, v in given.items() if type(v) is float]
 
 
 def lattice(scenes: int = B) -> mpm.Grid:
@@ -109,7 +92,7 @@ def test_other_lengths_are_errors(law: str, name: str, device: str) -> None:
 @pytest.mark.parametrize("n", WRONG)
 def test_all_other_lengths_are_errors_in_all_ways(way: str, n: int, device: str) -> None:
     with pytest.raises(ValueError, match=rf"^mu must have shape .*got \[{n}\] with B = {B}$"):
-        WAYS[way](lattice(), law_with("hencky", "mu", values("hencky", "mu", n, device)), batch(device))
+        WAYS[way](lattice(), law_with("lame", "mu", values("lame", "mu", n, device)), batch(device))
 
 
 @pytest.mark.parametrize(("law", "name"), PARAMETERS)

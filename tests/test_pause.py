@@ -7,18 +7,13 @@ import pytest
 import torch
 
 import torch_mpm as mpm
+from benchmarks.catalogue.laws import named
 
 DT = 1e-3
-LAWS = {
-    "elastic": lambda: mpm.NeoHookean(E=1e4, nu=0.3),
-    "sand": lambda: mpm.QuarticSand(E=1e5, nu=0.3, friction_angle=0.6, volume_correction=True),
-    "fluid": lambda: mpm.WeaklyCompressible(1e4, viscosity=2.0),
-    "rate": lambda: mpm.HerschelBulkley(E=1e5, nu=0.3, yield_stress=10.0, consistency=5.0, exponent=0.7),
-    "snow": lambda: mpm.Snow(E=1e5, nu=0.2),
-}
+LAWS = named("neo_hookean", "sand", "fluid", "herschel_bulkley", "snow")
 
 
-def scenes(count, device, law="elastic", obstacle=True, **options):
+def scenes(count, device, law="neo_hookean", obstacle=True, **options):
     """Blocks that fall on an obstacle, in one batch after some steps, so that all fields are there."""
     grid = mpm.Grid(0.1, (0, 0), (1, 1), scenes=count)
     boundaries = [mpm.Sphere((0.5, 0.2), 0.15, friction=0.3)] if obstacle else []
@@ -135,7 +130,7 @@ def test_fields_that_the_first_step_makes_are_at_rest_in_a_pause(device):
     grid = mpm.Grid(0.1, (0, 0), (1, 1), scenes=2)
     one = mpm.State.at_rest(mpm.seed.box((0.3, 0.3), (0.6, 0.6), 0.1), velocity=(1.0, 0.0), device=device)
     state = mpm.State.concatenate([one, one], scene=True)
-    end = mpm.Step(grid, LAWS["elastic"]())(state, torch.tensor([DT, 0.0], device=device))
+    end = mpm.Step(grid, LAWS["neo_hookean"]())(state, torch.tensor([DT, 0.0], device=device))
     still = state.scene == 1
     assert end.C is not None and not end.C[still].any()
     assert torch.equal(end.F[still], torch.eye(2, device=device).expand_as(end.F[still]))

@@ -2,10 +2,10 @@
 
 import pytest
 import torch
+from cases.rollouts import F64, blob, box
+from helpers import TOLERANCE
 
 import torch_mpm as mpm
-from tests.helpers import TOLERANCE
-from tests.test_rollouts import F64, blob, box
 
 DT = 1e-4
 

@@ -52,7 +52,7 @@ def test_a_scene_that_flies_apart(dim, device):
     cloud = block_state(dim, low=0.45, high=0.55, dx=dx, spin=0.0)
     cloud = cloud.replace(v=rate * (cloud.x - 0.5) + torch.tensor([3.0] + [0.0] * (dim - 1)))
     state = joined([cloud, block_state(dim)], device)
-    step, single = (make(dim, 2, "fluid", dx=dx, grid={"deterministic": True, "max_blocks": 3000}) for _ in range(2))
+    step, single = (make(dim, 2, "water", dx=dx, grid={"deterministic": True, "max_blocks": 3000}) for _ in range(2))
     end, expected = both(step, single, state, 40, 2.5e-4)
     step.check(end)
     assert int(single._activations.status[0, 0]) > blocks  # wanted at most

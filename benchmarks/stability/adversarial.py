@@ -16,6 +16,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ import torch_mpm as mpm
 from torch_mpm.laws.parameters import Overlay
 
 from .. import common
+from ..catalogue.laws import FORMS
 from .stable_dt import LAWS as SOLIDS
 
 STEPS = 200
@@ -38,12 +40,12 @@ DESCRIBED = ("number", "motion", "law", "dim", "kernel", "transfer", "flip", "st
 
 LAWS: dict[str, Callable[[float, float], mpm.Material]] = {
     **SOLIDS,  # type: ignore[dict-item]
-    "sand, unilateral": lambda E, nu: mpm.QuarticSand(E=E, nu=nu),
-    "sand, full": lambda E, nu: mpm.QuarticSand(E=E, nu=nu, energy="full"),
-    "sand, Hencky": lambda E, nu: mpm.QuarticSand(E=E, nu=nu, energy="hencky"),
-    "water, γ = 7": lambda E, nu: mpm.WeaklyCompressible(E),
-    "water, γ = 1": lambda E, nu: mpm.WeaklyCompressible(E, gamma=1.0),
-    "viscous water": lambda E, nu: mpm.WeaklyCompressible(E, viscosity=0.01 * E),
+    "sand, unilateral": FORMS["sand_unilateral"],
+    "sand, full": FORMS["sand_full"],
+    "sand, Hencky": FORMS["sand_hencky"],
+    "water, γ = 7": FORMS["water"],
+    "water, γ = 1": partial(FORMS["water"], gamma=1.0),
+    "viscous water": lambda E, nu: FORMS["water"](E, viscosity=0.01 * E),
 }
 MOTIONS = (
     "impact", "collision", "crushing", "spinning", "stretching", "density jump", "spray", "sheet", "obstacle",

@@ -14,6 +14,7 @@ import itertools
 import sys
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from torch import Tensor
 import torch_mpm as mpm
 
 from .. import common
+from ..catalogue import laws
 
 DENSITY = 1000.0
 GROWTH = 100.0
@@ -31,20 +33,21 @@ STEPS = 150
 COARSE = [0.9 * 1.25**k for k in range(10)]
 """Multiples of the estimate that are tried first."""
 
+STRENGTH = 0.05
+"""Strength of plastic laws, so that large strains yield."""
 LAWS: dict[str, Callable[[Tensor, Tensor], mpm.Material]] = {
-    "neo-Hookean": lambda E, nu: mpm.NeoHookean(E=E, nu=nu),
-    "fixed corotated": lambda E, nu: mpm.FixedCorotated(E=E, nu=nu),
-    "Hencky": lambda E, nu: mpm.Hencky(E=E, nu=nu),
-    "von Mises": lambda E, nu: mpm.VonMises(E=E, nu=nu, yield_stress=0.05 * E, hardening=0.02 * E),
-    "Herschel-Bulkley": lambda E, nu: mpm.HerschelBulkley(
-        E=E, nu=nu, yield_stress=0.02 * E, consistency=1e-3 * E, exponent=0.6
-    ),
-    "snow": lambda E, nu: mpm.Snow(E=E, nu=nu),
-    "Cam-Clay": lambda E, nu: mpm.CamClay(
-        E=E, nu=nu, critical_slope=1.2, consolidation=0.02 * E, hardening=10.0, cohesion=0.2
-    ),
+    title: partial(law, strength=STRENGTH)
+    for title, law in {
+        "neo-Hookean": laws.LAWS["neo_hookean"],
+        "fixed corotated": laws.LAWS["fixed_corotated"],
+        "Hencky": laws.LAWS["hencky"],
+        "von Mises": laws.LAWS["von_mises"],
+        "Herschel-Bulkley": laws.LAWS["herschel_bulkley"],
+        "snow": laws.LAWS["snow"],
+        "Cam-Clay": laws.LAWS["cam_clay"],
+    }.items()
 }
-"""Laws of Young's modulus and Poisson's ratio; the other parameters so that large strains yield."""
+"""Laws of Young's modulus and Poisson's ratio."""
 
 
 MATERIAL = ("dim", "E", "nu", "stretch", "stable")

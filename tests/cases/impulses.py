@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 import torch_mpm as mpm
+from benchmarks.catalogue.laws import named
 
 F64 = torch.float64
 DT, STEPS = 1e-3, 8
@@ -15,12 +16,7 @@ WALLS = {
     "slip": mpm.Walls("slip"),
     "mirror": mpm.Walls("mirror"),
 }
-LAWS = {
-    "elastic": lambda: mpm.NeoHookean(E=1e4, nu=0.3),
-    "sand": lambda: mpm.QuarticSand(E=1e5, nu=0.3, friction_angle=0.6),
-    "fluid": lambda: mpm.WeaklyCompressible(1e4, viscosity=1.0),
-    "custom": lambda: mpm.CustomLaw(lambda F: 1e3 * (F @ F.mT - torch.eye(F.shape[1]).to(F)), stiffness=1e4),
-}
+LAWS = named("neo_hookean", "sand", "fluid", "custom")
 GRAVITY = (1.0, -9.8, 0.5)
 
 

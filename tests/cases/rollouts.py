@@ -8,6 +8,7 @@ from helpers import TOLERANCE
 from torch import Tensor
 
 import torch_mpm as mpm
+from benchmarks.catalogue.laws import having, named
 
 SEEDS = range(40)
 
@@ -69,21 +70,8 @@ def box(dim: int = 3, dx: float = 0.0625, **options) -> mpm.Grid:
     return mpm.Grid(dx=dx, lower=(0.0,) * dim, upper=(1.0,) * dim, **options)
 
 
-LAWS_HERE = {
-    "neo_hookean": lambda: mpm.NeoHookean(E=1e4, nu=0.3),
-    "fluid": lambda: mpm.WeaklyCompressible(1e4, viscosity=1.0),
-    "fixed_corotated": lambda: mpm.FixedCorotated(E=1e4, nu=0.3),
-    "hencky": lambda: mpm.Hencky(E=1e4, nu=0.3),
-    "von_mises": lambda: mpm.VonMises(E=1e4, nu=0.3, yield_stress=30.0, hardening=100.0),
-    "herschel_bulkley": lambda: mpm.HerschelBulkley(E=1e4, nu=0.3, yield_stress=10.0, consistency=5.0, exponent=0.7),
-    "snow": lambda: mpm.Snow(E=1e4, nu=0.3),
-    "cam_clay": lambda: mpm.CamClay(
-        E=1e4, nu=0.3, critical_slope=1.2, consolidation=500.0, hardening=8.0, cohesion=0.1
-    ),
-    "viscoelastic": lambda: mpm.Viscoelastic(E=1e4, nu=0.3, branch_modulus=3e3, relaxation_time=0.01),
-    "sand": lambda: mpm.QuarticSand(E=1e5, nu=0.3, volume_correction=True),
-    "sand_keep": lambda: mpm.QuarticSand(E=1e5, nu=0.3, apex="keep"),
-}
+LAWS_HERE = having("compiled") | named("sand_keep")
+"""Laws that the op of rollouts computes."""
 TRANSFERS = {
     "apic": {},
     "pic": {"transfer": "pic"},
@@ -111,8 +99,9 @@ def each_scene(device: str, dtype: torch.dtype = F64, transfer: str = "apic") ->
     """Three scenes, with an obstacle that moves and one that comes."""
     ball = mpm.Sphere((0.5, 0.2), 0.2, velocity=(0.0, 2.0), friction=0.2)
     late = mpm.Box((0.3, 0.5), (0.2, 0.2), start=2.5 * DT, kind="sticky")
-    law = mpm.HerschelBulkley(E=1e4, nu=0.3, yield_stress=10.0, consistency=5.0, exponent=0.7)
-    step = mpm.Step(box(2, scenes=3), law, (0.5, -9.8), "separate", [ball, late], **TRANSFERS[transfer])
+    step = mpm.Step(
+        box(2, scenes=3), LAWS_HERE["herschel_bulkley"](), (0.5, -9.8), "separate", [ball, late], **TRANSFERS[transfer]
+    )
     scene = (torch.arange(300) % 3).int().to(device)
     state = blob(device, 2, dtype=dtype).replace(scene=scene)
     return step, step.with_impulses(step.prepare(state))

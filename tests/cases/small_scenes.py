@@ -7,16 +7,11 @@ import torch
 from helpers import relative_error
 
 import torch_mpm as mpm
+from benchmarks.catalogue.laws import named
 
 F32, F64 = torch.float32, torch.float64
 DT, N = 1e-3, 12
-LAWS = {
-    "neo_hookean": lambda: mpm.NeoHookean(E=1e4, nu=0.3),
-    "fixed_corotated": lambda: mpm.FixedCorotated(E=1e4, nu=0.3),
-    "sand": lambda: mpm.QuarticSand(E=1e5, nu=0.3, friction_angle=0.5),
-    "von_mises": lambda: mpm.VonMises(E=1e4, nu=0.3, yield_stress=50.0),
-    "fluid": lambda: mpm.WeaklyCompressible(bulk_modulus=1e4),
-}
+LAWS = named("neo_hookean", "fixed_corotated", "sand", "von_mises", "water")
 
 
 def joined(blocks, device):

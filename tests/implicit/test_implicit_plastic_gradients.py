@@ -10,6 +10,7 @@ import torch
 from helpers import relative_error
 
 import torch_mpm as mpm
+from benchmarks.catalogue.laws import having
 from torch_mpm.implicit import Implicit, adjoint, equilibrium, implicit
 from torch_mpm.laws.compiled import CompiledLaw
 from torch_mpm.laws.parameters import Overlay
@@ -20,11 +21,8 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 MODULI = {"E": 1e5, "nu": 0.3}
 PARAMETERS = {
-    mpm.VonMises: {**MODULI, "yield_stress": 2e3, "hardening": 2e4},
-    mpm.HerschelBulkley: {**MODULI, "yield_stress": 1e3, "consistency": 300.0, "exponent": 0.7},
-    mpm.Snow: {**MODULI, "critical_compression": 0.025, "critical_stretch": 0.0075, "hardening": 5.0},
-    mpm.CamClay: {**MODULI, "critical_slope": 1.0, "consolidation": 2e3, "hardening": 5.0, "cohesion": 0.1},
-    mpm.QuarticSand: {**MODULI, "friction_angle": 0.5},
+    law.make: {name: value for name, value in law.arguments(**MODULI, strength=0.02).items() if type(value) is float}
+    for law in having("plastic").values()
 }
 ENERGIES = ("full", "unilateral", "hencky", "mixed")
 LAWS = [*((law, {}) for law in PARAMETERS if law is not mpm.QuarticSand)]

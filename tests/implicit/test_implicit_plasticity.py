@@ -8,22 +8,15 @@ import torch
 from helpers import relative_error
 
 import torch_mpm as mpm
+from benchmarks.catalogue.laws import having, named
 from torch_mpm.implicit import Implicit
 from torch_mpm.implicit.system import ImplicitSystem
 from torch_mpm.laws.flowing import flowing_stress, flowing_tangent
 from torch_mpm.laws.parameters import Overlay
 from torch_mpm.ops import implicit_apply
 
-LAWS = {
-    "von_mises": mpm.VonMises(E=1e6, nu=0.3, yield_stress=2e4, hardening=1e5),
-    "herschel_bulkley": mpm.HerschelBulkley(E=1e6, nu=0.3, yield_stress=1e4, consistency=1e3),
-    "snow": mpm.Snow(E=1e6, nu=0.2),
-    "cam_clay": mpm.CamClay(E=1e6, nu=0.3, critical_slope=1.0, consolidation=1e4, hardening=5.0),
-    **{
-        f"sand_{energy}": mpm.QuarticSand(E=1e6, nu=0.3, friction_angle=0.6, energy=energy)
-        for energy in ("full", "unilateral", "hencky", "mixed")
-    },
-}
+KINDS = having("plastic") | named("sand_full", "sand_hencky", "sand_mixed")
+LAWS = {name: law(1e6, 0.3, 0.02) for name, law in KINDS.items()}
 ASSOCIATED = ("von_mises", "herschel_bulkley")
 
 

@@ -12,6 +12,7 @@ from oracle import principal as reference
 from torch import Tensor
 
 import torch_mpm as mpm
+from benchmarks.catalogue.laws import named
 from torch_mpm import ops
 from torch_mpm.ops import law_energy, law_stiffness, law_update, law_wave_modulus
 from torch_mpm.ops.law import ELASTIC, INVALID, PLASTIC
@@ -716,14 +717,7 @@ def test_strides_and_remainders(device, law):
 
 
 def laws() -> dict[str, mpm.Material]:
-    return {
-        "fixed_corotated": mpm.FixedCorotated(E=1e5, nu=0.3),
-        "hencky": mpm.Hencky(E=1e5, nu=0.3),
-        "von_mises": mpm.VonMises(E=1e5, nu=0.3, yield_stress=2e3, hardening=1e3),
-        "herschel_bulkley": mpm.HerschelBulkley(E=1e5, nu=0.3, yield_stress=100.0, consistency=5.0, exponent=0.6),
-        "snow": mpm.Snow(E=1e5, nu=0.2),
-        "cam_clay": mpm.CamClay(E=1e5, nu=0.2, critical_slope=1.2, consolidation=1e3, hardening=10.0, cohesion=0.2),
-    }
+    return {name: law(1e5, 0.3, 0.02) for name, law in named(*LAWS).items()}
 
 
 def block(dim: int) -> tuple[mpm.Grid, mpm.State]:

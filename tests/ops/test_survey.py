@@ -4,10 +4,11 @@ import math
 
 import pytest
 import torch
+from helpers import TOLERANCE
 from oracle import cfl as reference
 
 import torch_mpm as mpm
-from tests.helpers import TOLERANCE
+from benchmarks.catalogue.laws import named
 from torch_mpm.ops import survey
 from torch_mpm.step.stability import figures_of
 
@@ -141,15 +142,7 @@ def test_op_is_well_formed(device):
     torch.library.opcheck(torch.ops.torch_mpm.survey, arguments)
 
 
-LAWS = {
-    "neo_hookean": lambda: mpm.NeoHookean(E=2e4, nu=0.3),
-    "sand": lambda: mpm.QuarticSand(E=1e5, nu=0.25, friction_angle=0.5),
-    "hardening": lambda: mpm.QuarticSand(E=1e5, nu=0.25, hardening=(0.6, 0.1, 10.0, 0.2)),
-    "von_mises": lambda: mpm.VonMises(E=1e5, nu=0.3, yield_stress=2e3, hardening=1e4),
-    "snow": lambda: mpm.Snow(E=1e5, nu=0.2),
-    "fluid": lambda: mpm.WeaklyCompressible(bulk_modulus=1e4, viscosity=2.0),
-    "temperature": lambda: mpm.NeoHookean(E=mpm.Table([0.0, 1.0], [1e4, 2e4]), nu=0.3),
-}
+LAWS = named("neo_hookean", "sand", "sand_hardening", "von_mises", "snow", "fluid", "softening")
 
 
 def deformed(law, dim, device, dtype, scenes=3):

@@ -1,0 +1,1 @@
+"""Laws and scenes that tests and benchmarks have in common."""
