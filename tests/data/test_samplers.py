@@ -1,15 +1,18 @@
 """Distributions against their laws, and scenes that are drawn from them."""
 
+import copy
 import datetime
+import functools
 import itertools
 import math
+import operator
 
 import numpy as np
 import pytest
 
 pytest.importorskip("pydantic")
 
-from generated import configuration
+from generated import configuration, words
 from scipy import stats
 
 from torch_mpm.data import distribution
@@ -150,6 +153,39 @@ def test_configurations_that_cannot_be(changes, message):
     with pytest.raises(SceneError) as error:
         configuration(**changes)
     assert any(problem.startswith(message) for problem in error.value.problems), error.value.problems
+
+
+def places_of(words, place=()):
+    """Paths of all entries of nested tables and lists."""
+    entries = words.items() if isinstance(words, dict) else enumerate(words) if isinstance(words, list) else ()
+    for key, value in entries:
+        yield (*place, key)
+        yield from places_of(value, (*place, key))
+
+
+def longer(value):
+    """A list with one more entry."""
+    return [*value, value[0]] if isinstance(value, list) and value else value
+
+
+WRONG = {"table": lambda value: {"a": 1}, "list": lambda value: ["a"], "longer": longer}
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_entries_that_do_not_fit_are_errors_by_name(wrong):
+    """Or no errors, where such an entry is possible; never one of the program."""
+    capsule = {"shape": "capsule", "center": [0.5, 0.1], "axis": [0.2, 0.0], "radius": 0.05}
+    with_obstacle = words(obstacle=[capsule])
+    refused = 0
+    for *path, last in places_of(with_obstacle):
+        mutated = copy.deepcopy(with_obstacle)
+        table = functools.reduce(operator.getitem, path, mutated)
+        table[last] = WRONG[wrong](table[last])
+        try:
+            check_samples(Configuration.from_words(mutated), 1)
+        except SceneError:
+            refused += 1
+    assert refused >= {"table": 40, "list": 40, "longer": 8}[wrong]
 
 
 def test_a_configuration_without_its_tables():

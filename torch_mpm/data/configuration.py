@@ -37,6 +37,7 @@ from pydantic import Field, ValidationError
 
 from ..files import check_file
 from ..scene import Scene, SceneError, schema
+from ..scene.check import corner_problems
 from ..scene.explain import explain, text_problems
 from ..scene.scene import override, parsed
 from . import distribution
@@ -249,6 +250,7 @@ def _checked(words: Words) -> Dataset:
     except (ValidationError, KeyError, TypeError):
         grid = None  # The first sample will show it.
     if grid is not None:
+        problems += corner_problems(grid)
         for key in VARIED:
             problems += distribution.problems(words.get(key), key, len(grid.lower))
     if not misshapen:

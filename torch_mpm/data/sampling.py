@@ -84,7 +84,8 @@ ALONG = {"box": "size", "cylinder": "axis", **ALONG_OBSTACLES}
 
 def with_ends(words: Words, names: dict[str, str] = ALONG) -> Words:
     """Shape with its ends, as in scene files, instead of a center and a vector between the ends."""
-    along = names.get(words.get("shape", ""))
+    shape = words.get("shape")
+    along = names.get(shape) if isinstance(shape, str) else None
     if along is None or "center" not in words or along not in words:
         return words
     center, whole = words["center"], words[along]

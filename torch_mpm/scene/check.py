@@ -74,7 +74,7 @@ def _grid_problems(scene: Any, scenes: int) -> Iterator[str]:
     grid: schema.Grid | None = scene.grid
     if grid is None:
         return
-    found = list(_corner_problems(grid))
+    found = list(corner_problems(grid))
     if scene.origin is not None and len(scene.origin) != len(grid.lower):
         found.append(f"origin: must have {len(grid.lower)} numbers like grid.lower, got {scene.origin}")
     yield from found
@@ -96,7 +96,8 @@ def _grid_problems(scene: Any, scenes: int) -> Iterator[str]:
         yield f"grid.walls: {error}"
 
 
-def _corner_problems(grid: schema.Grid) -> Iterator[str]:
+def corner_problems(grid: schema.Grid) -> Iterator[str]:
+    """Corners, walls or cells of a grid that do not fit each other."""
     dim = len(grid.lower)
     if len(grid.upper) != dim:
         yield f"grid.upper: must have {dim} numbers like grid.lower, got {grid.upper}"
