@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import torch_mpm as mpm
-from torch_mpm.rollouts import graph_segments
+from torch_mpm.cuda_graphs.memory import on_own_stream
 
 F64 = torch.float64
 CYCLES = 200_000_000  # of a kernel that runs for a tenth of a second
@@ -28,7 +28,7 @@ def still_busy(stream: torch.cuda.Stream) -> torch.cuda.Event:
 @pytest.mark.parametrize("fails", [False, True])
 def test_the_current_stream_waits_for_the_stream_of_graphs(fails):
     device = torch.device("cuda", torch.cuda.current_device())
-    with contextlib.suppress(ZeroDivisionError), graph_segments._on_own_stream(device):
+    with contextlib.suppress(ZeroDivisionError), on_own_stream(device):
         end = still_busy(torch.cuda.current_stream())
         if fails:
             raise ZeroDivisionError
@@ -50,7 +50,7 @@ import torch
 import torch_mpm as mpm
 from test_capture_errors import blob
 from torch_mpm.rollouts import graph_segments
-from torch_mpm.graphs import Replays
+from torch_mpm.cuda_graphs.graph import Replays
 
 class Waiting(torch.nn.Module):
     def __init__(self, step, calls):

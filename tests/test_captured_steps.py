@@ -69,7 +69,7 @@ def recorded(device, monkeypatch):
     monkeypatch.setattr(graph_segments, "Graphs", Counted)
     if device == "cpu":
         monkeypatch.setattr(graph_segments, "has_graphs", lambda device: True)
-        monkeypatch.setattr(graph_segments, "_on_own_stream", lambda device: contextlib.nullcontext())
+        monkeypatch.setattr(graph_segments, "on_own_stream", lambda device: contextlib.nullcontext())
     return made
 
 

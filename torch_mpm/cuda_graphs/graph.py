@@ -3,29 +3,17 @@
 from __future__ import annotations
 
 import collections
-import threading
 from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
 from ..state.state import FIELDS, State
-from .capture import capturing
+from .memory import GraphMemory
 
 PIECE, PIECES, LEAST_PARTICLES = 2**25, 4, 2**13
 """Work of a piece, as particles times steps; number of pieces in flight; number of particles below which the time of a
 step does not decrease (csrc/common/signals.op.cpp)."""
-
-
-class _Latest(threading.local):
-    """For each stream of a thread: the stream on which graphs for it are captured, and the latest of these graphs. The
-    next graph runs after that one and reuses its memory, which the allocator reuses within a stream only."""
-
-    def __init__(self) -> None:
-        self.captures: dict[tuple[torch.device, int], tuple[torch.cuda.Stream, torch.cuda.CUDAGraph | None]] = {}
-
-
-_LATEST = _Latest()
 
 
 class WorkInFlight:
@@ -68,18 +56,9 @@ class Replays:
         self.state = state.map(copied)
         impulse = None if state.impulse is None else copied(state.impulse)
         self.state = self.state.replace(material=state.material, scene=state.scene, ids=state.ids, impulse=impulse)
-        self._graph = torch.cuda.CUDAGraph()
-        device = state.x.device
-        now = torch.cuda.current_stream(device)
-        place = device, now.cuda_stream
-        aside, latest = _LATEST.captures.get(place) or (torch.cuda.Stream(device), None)
-        aside.wait_stream(now)
-        try:
-            with torch.cuda.stream(aside), capturing(self._graph, None if latest is None else latest.pool(), device):
-                self._record(function)
-        finally:
-            now.wait_stream(aside)
-        _LATEST.captures[place] = aside, self._graph
+        self._graph, self._memory = torch.cuda.CUDAGraph(), GraphMemory(state.x.device, waits=False)
+        with self._memory.recorded(self._graph):
+            self._record(function)
 
     def _record(self, function: Callable[[State], State]) -> None:
         before, after = tensors_of(self.state), tensors_of(function(self.state))

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import collections
 import contextlib
-import functools
-import threading
 import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
@@ -15,9 +12,10 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from ..boundaries.control import control_step, steady
-from ..cuda_graphs.capture import Recordings, Same, capturing
+from ..cuda_graphs.capture import Recordings, Same
 from ..cuda_graphs.graph import WorkInFlight, copied, copy_all, tensors_of, time_tensor
 from ..cuda_graphs.keys import StepKey, autocast_of, surroundings
+from ..cuda_graphs.memory import GraphMemory, on_own_stream
 from ..errors import check_count, shape_of
 from ..grid.grid import own_pools
 from ..laws.mixture import Mixture
@@ -393,7 +391,7 @@ class Graphs:
         Raises:
             ValueError: gradients would pass to a tensor that is no argument, and replays would lose them.
         """
-        with _on_own_stream(self._device):
+        with on_own_stream(self._device):
             ends = self._steps(*self.read)
             if other := next(_others(ends, self.read), None):
                 raise ValueError(
@@ -415,14 +413,13 @@ class Graphs:
     def record(self, beside: Graphs | None) -> None:
         """Record the graphs, in the memory of `beside` if given."""
         self._forward, self._backward = torch.cuda.CUDAGraph(), torch.cuda.CUDAGraph()
-        self._memory: _GraphMemory = _GraphMemory(self._device) if beside is None else beside._memory
-        with _into(self._forward, self._memory.pool, self._device):
+        self._memory: GraphMemory = GraphMemory(self._device, waits=True) if beside is None else beside._memory
+        with self._memory.recorded(self._forward):
             ends = self._steps(*self.read)
-        self._memory.owned_by(self._forward)
         self.follows = [t.requires_grad for t in ends]
         self._grads = [torch.zeros_like(t) for t in ends if t.requires_grad]
         if self._grads:
-            with _into(self._backward, self._memory.pool, self._device):
+            with self._memory.recorded(self._backward):
                 self._found = self._gradients(ends, self._grads)
         self._ends = [t.detach() for t in ends]
 
@@ -460,68 +457,3 @@ def _others(ends: Sequence[Tensor], read: Sequence[Tensor]) -> Iterator[str]:
         if node.name().endswith("AccumulateGrad") and not any(node.variable is t for t in read):
             yield f"one of shape {list(node.variable.shape)}"
         waiting += [parent for parent, _ in node.next_functions if parent is not None]
-
-
-class _Streams(threading.local):
-    """Streams of a thread on which graphs are captured, one per device, since libraries allocate memory per stream.
-
-    Attributes:
-        of: the stream of a device.
-        unused: graphs that are no longer replayed; each holds memory for later graphs of its device.
-    """
-
-    def __init__(self) -> None:
-        self.of: Callable[[torch.device], torch.cuda.Stream] = functools.cache(torch.cuda.Stream)
-        self.unused: dict[torch.device, list[torch.cuda.CUDAGraph]] = collections.defaultdict(list)
-
-
-_STREAMS = _Streams()
-
-
-class _GraphMemory:
-    """Memory shared by graphs, reused from destroyed graphs if possible.
-
-    The allocator does not free the memory of a destroyed graph for other processes until it runs short. Therefore the
-    last user of the memory stores one graph, and the next recording reuses its memory.
-    """
-
-    def __init__(self, device: torch.device) -> None:
-        self._unused = _STREAMS.unused[device]
-        self._owner: torch.cuda.CUDAGraph | None = None
-        if self._unused:
-            self.owned_by(self._unused.pop())
-
-    @property
-    def pool(self) -> Any:
-        """Identity of the memory; None before the first graph."""
-        return None if self._owner is None else self._owner.pool()
-
-    def owned_by(self, graph: torch.cuda.CUDAGraph) -> None:
-        """Name the graph that holds the memory, unless there is one."""
-        if self._owner is None:
-            self._owner = graph
-            weakref.finalize(self, self._unused.append, graph).atexit = False
-
-
-@contextlib.contextmanager
-def _on_own_stream(device: torch.device) -> Iterator[None]:
-    """The stream of graphs as the current one, in order with the work before and after.
-
-    The current stream waits on every exit, exceptions included. Otherwise memory of its tensors, freed at the exit,
-    could be reused while kernels of the other stream still read it.
-    """
-    now, stream = torch.cuda.current_stream(device), _STREAMS.of(device)
-    stream.wait_stream(now)
-    try:
-        with torch.cuda.stream(stream):
-            yield
-    finally:
-        now.wait_stream(stream)
-
-
-@contextlib.contextmanager
-def _into(graph: torch.cuda.CUDAGraph, pool: Any, device: torch.device) -> Iterator[None]:
-    """Context whose operations are captured in a graph with the memory of a pool; None for new memory."""
-    torch.cuda.synchronize(device)
-    with _on_own_stream(device), capturing(graph, pool, device):
-        yield
