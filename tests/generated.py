@@ -58,7 +58,7 @@ def decoded(folder: Path) -> dict[str, Any]:
 
 
 def assert_same(a: Path, b: Path) -> None:
-    """Two data sets of the same scenes, to the last bit."""
+    """Two data sets of the same scenes, to the last byte of every file of their shards."""
     one, other = decoded(a), decoded(b)
     assert one and one.keys() == other.keys()
     for name, (arrays, attributes) in one.items():
@@ -67,6 +67,8 @@ def assert_same(a: Path, b: Path) -> None:
             np.testing.assert_array_equal(values, other[name][0][key], err_msg=f"{name}/{key}")
     hashes = [{s.id: s.hash for s in DatasetFolder(folder).attempted()} for folder in (a, b)]
     assert hashes[0] == hashes[1]
+    files = [{file.name: file.read_bytes() for file in (folder / "shards").iterdir()} for folder in (a, b)]
+    assert files[0] == files[1]
 
 
 PROCESSES = multiprocessing.get_context("forkserver")
