@@ -5,6 +5,7 @@ import subprocess
 import sys
 
 import pytest
+import torch
 
 import torch_mpm as mpm
 from torch_mpm._moved import MOVED, RENAMED
@@ -34,6 +35,16 @@ def test_removed_modules():
 def test_old_names(old):
     with pytest.warns(DeprecationWarning, match=f"torch_mpm.{old} is now torch_mpm.{RENAMED[old]}"):
         assert getattr(mpm, old) is getattr(mpm, RENAMED[old])
+
+
+@pytest.mark.parametrize("old,new", [("survey", "stability_report"), ("figures", "diagnostics")])
+def test_old_names_of_methods(old, new):
+    step = mpm.Step(mpm.Grid(0.25, (0.0, 0.0), (1.0, 1.0)), mpm.NeoHookean(E=1e4, nu=0.3))
+    state = mpm.State(x=torch.full((1, 2), 0.5), v=torch.ones(1, 2), mass=torch.ones(1), volume=torch.ones(1))
+    with pytest.warns(DeprecationWarning, match=f"Step.{old} is now Step.{new}"):
+        found = getattr(step, old)(state)
+    for a, b in zip(found, getattr(step, new)(state), strict=True):
+        assert torch.equal(a, b)
 
 
 def test_an_attribute_of_the_package(monkeypatch):

@@ -240,7 +240,7 @@ def test_materials_that_a_step_has_checked_stay_checked_when_it_sorts(device):
     state = mpm.rollout(step, blob(device).replace(material=number % 7), 2, 1e-4)
     for start, checked in ((step.sorted(state), False), (state.sorted(step.grid), True)):
         with OpNames() as names:
-            step.survey(start)
+            step.stability_report(start)
             mpm.rollout(step, start, 2, 1e-4)
         assert ("aten.all.default" in names.seen) == checked and "torch_mpm.substeps.default" in names.seen
 

@@ -336,7 +336,7 @@ def _export(options: argparse.Namespace) -> None:
 
 
 def _tqdm() -> Any:
-    return optional.load("tqdm", "the progress bar, which --quiet leaves out", "scene").tqdm
+    return optional.load("tqdm", "the progress bar, which --quiet disables", "scene").tqdm
 
 
 class _Bar:

@@ -37,8 +37,9 @@ Level isa_level() { return level; }
 
 void refuse_machine() {
   throw std::runtime_error(
-      "torch_mpm was built for a processor with other instructions than this one's (or than TORCH_MPM_ISA_LEVEL asks "
-      "for): build it on this machine, or with TORCH_MPM_ISA_LEVELS=all");
+      "torch_mpm was built for other instructions than those of this processor (or of TORCH_MPM_ISA_LEVEL): build it "
+      "on "
+      "this machine, or with TORCH_MPM_ISA_LEVELS=all");
 }
 
 }  // namespace mpm::cpu

@@ -6,14 +6,14 @@
 #include "grid/status.h"
 
 // Finds the active blocks, numbers them in the order of the table, groups the particles by base block with a stable
-// counting sort, and writes the schedule. Every result is the same for any number of threads. What it costs follows the
-// particles: of the table only tiles with active blocks are looked at.
+// counting sort, and writes the schedule. Every result is the same for any number of threads. The cost follows the
+// particles: only tiles of the table with active blocks are read.
 namespace mpm::cpu {
 inline namespace TORCH_MPM_ISA {
 
 using W = ActivateWorkspace;
 
-constexpr int64_t kWorthThreads = 8192;  // particles or slots below which threads cost more than they give
+constexpr int64_t kWorthThreads = 8192;  // number of particles or slots below which threads do not pay
 
 // Calls f(part, begin, end) for `parts` nearly equal parts of [0, count), in parallel.
 template <class F>
@@ -79,7 +79,7 @@ struct Activation {
 
 enum class Location { inside, outside, not_finite };
 
-// Scene and base node of one particle, and whether it is left out for its position or its scene.
+// Scene and base node of one particle, and whether it is skipped for its position or its scene.
 template <int Order, class T, int D>
 Location place_of(const ActivateArguments<T, D>& a, int64_t p, int& scene, int base[D]) {
   T x[D], f[D];
@@ -104,7 +104,7 @@ void classify(const Activation<T, D>& s, int64_t p) {
   s.w.cell[p] = uint8_t(node_in_block<D>(base));
 }
 
-// The same for kLanes particles at once; false, and nothing done, unless all are on the lattice.
+// The same for kLanes particles at once; false, without a result, unless all are on the lattice.
 template <int Order, class T, int D>
 bool classify_pack(const Activation<T, D>& s, int64_t p) {
   const ActivateArguments<T, D>& a = s.a;
@@ -151,7 +151,7 @@ void classify_slice(const Activation<T, D>& s, int64_t begin, int64_t end) {
   }
 }
 
-// visit(steps along the axes) for a block and all around it.
+// Calls visit(steps along the axes) for a block and its neighbours.
 template <int D, class F>
 void for_neighbours(const F& visit) {
   int step[3] = {};
@@ -168,18 +168,18 @@ MPM_HD unsigned touched_blocks_of_cell(int cell) {
   return touched_blocks<Order, D>(local);
 }
 
-// Entries of the table while its active blocks are not numbered: all bits are set where nothing is known; bit o is
-// clear if particles of the block touch its neighbour o, and kActive if those of another one touch the block.
+// Entries of the table before its active blocks are numbered: all bits are set by default; bit o is clear if particles
+// of the block touch its neighbour o, and kActive if particles of another block touch this one.
 constexpr int kActive = 1 << 8;
 
-// Of an entry where bits are cleared.
+// The entry of a block with cleared bits.
 template <class T, int D>
 void mark_tile(const Activation<T, D>& s, int64_t entry) {
   __atomic_fetch_or(s.w.marked + entry / kTile / 64, 1ull << entry / kTile % 64, __ATOMIC_RELAXED);
 }
 
-// Particles that follow each other are mostly of one base block: such runs are counted, and later placed, together.
-// `Marks` what they touch in the table.
+// Consecutive particles mostly have the same base block: such runs are counted, and later placed, together. With
+// `Marks` the blocks that they touch are marked in the table.
 template <int Order, bool Marks, class T, int D>
 void find_runs(const Activation<T, D>& s, int slice, int64_t begin, int64_t end) {
   uint8_t touched_of[kBlockNodes<D>];
@@ -204,15 +204,15 @@ void find_runs(const Activation<T, D>& s, int slice, int64_t begin, int64_t end)
   s.totals(slice)[W::kRuns] = runs;
 }
 
-// Takes out of the table what the activation before has put there: the blocks at the beginning of `block`.
+// Clears the table entries of the previous activation: the blocks at the beginning of `block`.
 template <class T, int D>
-void take_back(const Activation<T, D>& s) {
+void clear_previous(const Activation<T, D>& s) {
   const ActivateArguments<T, D>& a = s.a;
   for (int64_t slot = 0; slot < a.slots() && a.block[slot] >= 0; slot++) a.table[a.block[slot]] = -1;
 }
 
-// Numbers the active blocks in the order of the table, and takes the marks off the tiles; returns how many there are.
-// Particles touch no block before their own one, so that everything is known of an entry when its turn comes.
+// Numbers the active blocks in the order of the table, and clears the marks of the tiles; returns the number of blocks.
+// Particles touch no block before their own one, so an entry is complete when it is reached.
 template <class T, int D>
 int64_t number_blocks(const Activation<T, D>& s) {
   const ActivateArguments<T, D>& a = s.a;
@@ -231,7 +231,7 @@ int64_t number_blocks(const Activation<T, D>& s) {
     if (given) a.block[next] = int(b);
     next++;
   };
-  constexpr int kRow = 16;  // entries that are looked at together
+  constexpr int kRow = 16;  // entries that are read together
   for (int64_t word = 0; word < s.w.words; word++)
     while (s.w.marked[word]) {
       const int64_t begin = (word * 64 + __builtin_ctzll(s.w.marked[word])) * kTile;
@@ -351,7 +351,7 @@ int64_t list_base_blocks(const Activation<T, D>& s, int64_t slots) {
   return chunks;
 }
 
-// Order of a chunk's particles by cell. Returns how often one does not follow the one before it in memory.
+// Order of a chunk's particles by cell. Returns the number of particles that do not follow their predecessor in memory.
 template <class T, int D>
 int sort_chunk(const Activation<T, D>& s, int64_t chunk) {
   const int begin = s.schedule.chunk_begin[chunk], slot_end = s.a.offsets[s.schedule.chunk_slot[chunk] + 1];
@@ -371,8 +371,8 @@ int sort_chunk(const Activation<T, D>& s, int64_t chunk) {
   return breaks;
 }
 
-// Gives slots to blocks that particles may touch before the next activation: all neighbours of base blocks. Returns how
-// many slots have blocks then; tells where there is no room for all of them.
+// Assigns slots to blocks that particles may touch before the next activation: all neighbours of base blocks. Returns
+// the number of slots with blocks; reports in `next_drift` if there is no room for all of them.
 template <class T, int D>
 int64_t add_margin(const Activation<T, D>& s, int64_t slots) {
   const ActivateArguments<T, D>& a = s.a;
@@ -401,8 +401,8 @@ int64_t add_margin(const Activation<T, D>& s, int64_t slots) {
   return next;
 }
 
-// Counts a particle that is left out in a row of the status, unless an earlier activation has done so; whether it is
-// the first of the row so far.
+// Counts a skipped particle in a row of the status, unless an earlier activation has reported in the row. Returns
+// whether it is the first one of the row.
 bool report(int* row, int activation, Location place, int p) {
   if (row[kProblemActivation] >= 0 && row[kProblemActivation] != activation) return false;
   row[kProblemActivation] = activation;
@@ -424,7 +424,7 @@ void write_status(const Activation<T, D>& s, int64_t wanted, int64_t transferred
     int scene, base[D];
     const Location place = place_of<Order>(a, a.index[i], scene, base);
     const int p = a.origin ? a.origin[a.index[i]] : a.index[i];
-    if (place == Location::inside) continue;  // left out because the grid is full
+    if (place == Location::inside) continue;  // skipped because the grid is full
     if (scene == kAbsent) continue;
     report(status, activation, place, p);
     if (scene < 0 || scene >= a.scenes) continue;
@@ -441,10 +441,10 @@ void write_status(const Activation<T, D>& s, int64_t wanted, int64_t transferred
 template <int Order, class T, int D>
 void activate(const ActivateArguments<T, D>& a) {
   const Activation<T, D> s(a);
-  if (a.fresh)  // the table has no block yet
+  if (a.fresh)  // the table has no blocks yet
     __builtin_memset(s.w.marked, 0, sizeof(uint64_t) * s.w.words);
   else
-    take_back(s);
+    clear_previous(s);
   for_parts(s.w.slices, a.particles, [&](int slice, int64_t begin, int64_t end) {
     classify_slice<Order>(s, begin, end);
     find_runs<Order, true>(s, slice, begin, end);

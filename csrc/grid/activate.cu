@@ -8,21 +8,21 @@
 #include "grid/activate.h"
 #include "grid/status.h"
 
-// Finds the active blocks and groups the particles by base block, without the host knowing any count.
+// Finds the active blocks and groups the particles by base block, without any count on the host.
 //   classify   base block and rank of every particle, number of particles and touched neighbours of every block
 //   slots      numbers the active blocks in the order of the table (one-pass scan)
 //   offsets    first particle and work items of every slot (one-pass scan)
 //   place      the index tensor, base blocks and neighbours, unused slots, status
-// One kernel does all of it where there are few tiles, or where an activation may last several steps, if only to find
-// that it still does.
-// The scans pass over tiles of the table. Where it has many, over those alone that have active blocks, which `classify`
-// marks and `list_tiles` lists in their order; what they wrote is taken back before the next activation.
+// One kernel does all of this if there are few tiles, or if an activation may last several steps; often it only finds
+// that the activation still lasts.
+// The scans pass over tiles of the table; of a large table only over tiles with active blocks, which `classify` marks
+// and `list_tiles` lists in their order. Their writes are cleared before the next activation.
 // Deterministic mode replaces the ranks, which depend on the order of atomics, by the order of memory.
 namespace mpm::cuda {
 namespace {
 
 constexpr int kThreads = 256;
-constexpr int kManyTiles = 512;  // of which a list is worth two more kernels
+constexpr int kManyTiles = 512;  // number of tiles from which a list is worth two more kernels
 // Every kSampling-th thread block counts the base blocks met by its warps. More than 7/5 per warp on average, and the
 // gathers are faster in the order of memory than block by block.
 constexpr int kSampling = 64;
@@ -39,31 +39,31 @@ struct Counters {
   int groups, warps;  // of the thread blocks sampled
 };
 
-// Particles that are left out, zeroed before each activation. The lowest index is kept as the largest complement, so
-// that zero means none.
-struct LeftOut {
+// Skipped particles, zeroed before each activation. The lowest index is stored as the largest complement, so that zero
+// means none.
+struct Skipped {
   int count, first;
 };
-struct Trouble {
-  LeftOut outside, not_finite;
+struct ParticleErrors {
+  Skipped outside, not_finite;
 };
 
 // `count` becomes the first position in the index tensor, or -1 minus the position from its end for particles that are
 // not transferred. Bit o of `touched`: the neighbour one block further along the axes of o, the last axis being bit 0
 // of o.
-struct Tally {
+struct BlockCount {
   int count, touched;
 };
 
 struct Workspace {
   Counters* counters;
-  Trouble* trouble;                     // [1 + scenes] of all particles, and of each scene
+  ParticleErrors* errors;               // [1 + scenes] of all particles, and of each scene
   Packed *slot_states, *offset_states;  // one per tile of the scans
   unsigned char* marked;                // [tiles], in whole vectors; null where there are few
   int64_t zeroed;                       // bytes from the start before each activation, and
   int64_t zeroed_once;                  // before the first one
-  Tally* tally;                         // [table]
-  int *listed, *list;                   // number of tiles with active blocks, and which
+  BlockCount* block_counts;             // [table]
+  int *listed, *list;                   // number of tiles with active blocks, and their numbers
   int tiles;
   int *key, *rank;               // [P] table index (-1 outside) and rank among its particles
   int *slot, *slot_sorted, *id;  // [P], for the stable sort; slot_sorted is the index before it, too
@@ -90,7 +90,7 @@ Workspace lay_out(const ActivateArguments<T, D>& a) {
     return p;
   };
   w.counters = reinterpret_cast<Counters*>(take(sizeof(Counters)));
-  w.trouble = reinterpret_cast<Trouble*>(take((1 + int64_t(a.scenes)) * sizeof(Trouble)));
+  w.errors = reinterpret_cast<ParticleErrors*>(take((1 + int64_t(a.scenes)) * sizeof(ParticleErrors)));
   w.slot_states = reinterpret_cast<Packed*>(take(tiles * sizeof(Packed)));
   w.offset_states = reinterpret_cast<Packed*>(take(tiles * sizeof(Packed)));
   if (tiles > kManyTiles) w.marked = reinterpret_cast<unsigned char*>(take(tiles));
@@ -99,7 +99,7 @@ Workspace lay_out(const ActivateArguments<T, D>& a) {
     w.listed = reinterpret_cast<int*>(take(sizeof(int)));
     w.list = reinterpret_cast<int*>(take(tiles * sizeof(int)));
   }
-  w.tally = reinterpret_cast<Tally*>(take(table * sizeof(Tally)));
+  w.block_counts = reinterpret_cast<BlockCount*>(take(table * sizeof(BlockCount)));
   w.zeroed_once = w.size;
   w.key = reinterpret_cast<int*>(take(a.particles * sizeof(int)));
   w.rank = reinterpret_cast<int*>(take(a.particles * sizeof(int)));
@@ -114,14 +114,14 @@ Workspace lay_out(const ActivateArguments<T, D>& a) {
   return w;
 }
 
-// Counts a particle that is left out among all and in its scene, unless an earlier activation has told of that row: a
-// scene that is lost costs atomics only once.
+// Counts a skipped particle in row 0 and in the row of its scene, unless an earlier activation has reported in that
+// row: a lost scene costs atomics only once.
 template <class T, int D>
-__device__ void report(const ActivateArguments<T, D>& a, Trouble* trouble, bool finite, int scene, int row) {
+__device__ void report(const ActivateArguments<T, D>& a, ParticleErrors* errors, bool finite, int scene, int row) {
   const int p = a.origin ? a.origin[row] : row;
   const auto count_in = [&](int row) {
     if (a.previous_status && a.previous_status[row * int64_t(kStatusSize) + kProblemActivation] >= 0) return;
-    LeftOut& out = finite ? trouble[row].outside : trouble[row].not_finite;
+    Skipped& out = finite ? errors[row].outside : errors[row].not_finite;
     atomicAdd(&out.count, 1);
     atomicMax(&out.first, INT_MAX - p);
   };
@@ -148,7 +148,7 @@ __device__ void for_surroundings(const Geometry<T, D>& g, int b, const F& f) {
   }
 }
 
-// The tiles of the blocks that particles of a base block touch, or of all around it.
+// Marks the tiles of the blocks that particles of a base block touch, or of all blocks around it.
 template <class T, int D>
 __device__ void mark_tiles(const ActivateArguments<T, D>& a, const Workspace& w, int key, unsigned touched) {
   if (a.margin_blocks > 0) {
@@ -159,14 +159,14 @@ __device__ void mark_tiles(const ActivateArguments<T, D>& a, const Workspace& w,
     if (touched >> o & 1) w.marked[(key + further(a.geometry, o)) / kThreads] = 1;
 }
 
-// What the activation before wrote in the table and the tally.
+// Clears the table entries and counts of the previous activation.
 template <class T, int D>
-__device__ void take_back(const ActivateArguments<T, D>& a, const Workspace& w, int table) {
+__device__ void clear_previous(const ActivateArguments<T, D>& a, const Workspace& w, int table) {
   for (int i = int(blockIdx.x); i < *w.listed; i += int(gridDim.x)) {
     const int64_t b = int64_t(w.list[i]) * kThreads + threadIdx.x;
     if (b >= table) continue;
     a.table[b] = -1;
-    w.tally[b] = {0, 0};
+    w.block_counts[b] = {0, 0};
   }
 }
 
@@ -221,7 +221,7 @@ __device__ void classify(const ActivateArguments<T, D>& a, const Workspace& w, i
       touched = touched_blocks<Order, D>(base);
       key = block_index(a.geometry, scene, block);
     } else if (scene != kAbsent) {
-      report(a, w.trouble, finite, scene, int(row));
+      report(a, w.errors, finite, scene, int(row));
     }
   }
   // One atomic per block and warp: neighbours in memory are mostly neighbours in space.
@@ -240,10 +240,10 @@ __device__ void classify(const ActivateArguments<T, D>& a, const Workspace& w, i
     if (key < 0) {
       first = atomicAdd(&w.counters->tail, __popc(group));
     } else {
-      Tally* tally = w.tally + key;
-      first = atomicAdd(&tally->count, __popc(group));
-      if (touched_by_group & ~*const_cast<volatile int*>(&tally->touched)) {
-        atomicOr(&tally->touched, int(touched_by_group));
+      BlockCount* counts = w.block_counts + key;
+      first = atomicAdd(&counts->count, __popc(group));
+      if (touched_by_group & ~*const_cast<volatile int*>(&counts->touched)) {
+        atomicOr(&counts->touched, int(touched_by_group));
         if constexpr (Marks) mark_tiles(a, w, key, touched_by_group);
       }
     }
@@ -302,7 +302,7 @@ __device__ Packed exclusive_sum(Packed value, Packed* states, int tile) {
   return before + inside;
 }
 
-// Tiles are numbered in the order in which thread blocks ask, so that those before are always running or done.
+// Thread blocks take tiles in ascending order, so that the tiles before are always running or done.
 __device__ int next_tile(int* counter) {
   __shared__ int tile;
   if (threadIdx.x == 0) tile = atomicAdd(counter, 1);
@@ -310,8 +310,8 @@ __device__ int next_tile(int* counter) {
   return tile;
 }
 
-// Calls body(number, first, last) with the number and the first table entry of one tile; or of tile after tile of those
-// that are listed, or of all, where fewer thread blocks may run than there are tiles.
+// Calls body(number, first, last) with the number and the first table entry of one tile; or of each listed tile, or of
+// all tiles in turn if fewer thread blocks may run than there are tiles.
 template <bool Many, class F>
 __device__ void each_tile(const Workspace& w, int* counter, const F& body) {
   if constexpr (!Many) {
@@ -330,7 +330,7 @@ __device__ void each_tile(const Workspace& w, int* counter, const F& body) {
 template <class T, int D>
 __device__ bool is_near_particles(const Geometry<T, D>& g, const Workspace& w, int b) {
   bool near = false;
-  for_surroundings(g, b, [&](int c) { near = near || w.tally[c].count > 0; });
+  for_surroundings(g, b, [&](int c) { near = near || w.block_counts[c].count > 0; });
   return near;
 }
 
@@ -347,7 +347,7 @@ __device__ void slots(const ActivateArguments<T, D>& a, const Workspace& w, int 
         bool inside = true;
 #pragma unroll
         for (int i = 0; i < D; i++) inside = inside && block[i] >= (o >> (D - 1 - i) & 1);
-        if (inside) active = active || w.tally[b - further(a.geometry, o)].touched >> o & 1;
+        if (inside) active = active || w.block_counts[b - further(a.geometry, o)].touched >> o & 1;
       }
     }
     const bool margin = Margin && a.margin_blocks > 0 && b < table && !active && is_near_particles(a.geometry, w, b);
@@ -370,12 +370,12 @@ __device__ void offsets(const ActivateArguments<T, D>& a, const Workspace& w, in
     const int b = first + int(threadIdx.x);
     int count = 0, items = 0, slot = -1;
     if (b < table) {
-      const Tally tally = w.tally[b];
+      const BlockCount counts = w.block_counts[b];
       slot = a.table[b];
-      count = tally.count;
-      // Slots grow with the table, so the furthest neighbour touched tells whether all have one.
-      if (count > 0 && a.table[b + further(a.geometry, 31 - __clz(tally.touched))] < 0) {
-        w.tally[b].count = -1 - atomicAdd(&w.counters->tail, count);
+      count = counts.count;
+      // Slots ascend with the table, so the furthest touched neighbour shows whether all have one.
+      if (count > 0 && a.table[b + further(a.geometry, 31 - __clz(counts.touched))] < 0) {
+        w.block_counts[b].count = -1 - atomicAdd(&w.counters->tail, count);
         count = 0;
       }
       const int most = a.most_of_item > 0 ? a.most_of_item : item_particles(a.particles);
@@ -389,7 +389,7 @@ __device__ void offsets(const ActivateArguments<T, D>& a, const Workspace& w, in
     }
     if (b >= table) return;
     if (slot >= 0 && slot < a.max_blocks) a.offsets[slot] = start;
-    if (count > 0) w.tally[b].count = start;
+    if (count > 0) w.block_counts[b].count = start;
     int4* const out = reinterpret_cast<int4*>(lay_out_schedule<D>(a.schedule, a.slots(), a.particles).items) + item;
     for (int k = 0; k < items; k++) {
       const int begin = start + int(int64_t(count) * k / items), end = start + int(int64_t(count) * (k + 1) / items);
@@ -401,23 +401,23 @@ __device__ void offsets(const ActivateArguments<T, D>& a, const Workspace& w, in
 template <class T, int D>
 __device__ void write_status(const ActivateArguments<T, D>& a, const Workspace& w, int row) {
   const int wanted = w.counters->wanted;
-  const Trouble& trouble = w.trouble[row];
+  const ParticleErrors& errors = w.errors[row];
   const int64_t start = row * int64_t(kStatusSize);
   int* const status = a.status + start;
   copy_status(a.previous_status ? a.previous_status + start : nullptr, status);
-  const bool left_out = trouble.outside.count > 0 || trouble.not_finite.count > 0;
-  if (status[kProblemActivation] < 0 && (left_out || (row == 0 && wanted > a.max_blocks))) {
+  const bool skipped = errors.outside.count > 0 || errors.not_finite.count > 0;
+  if (status[kProblemActivation] < 0 && (skipped || (row == 0 && wanted > a.max_blocks))) {
     const int missed = a.missed && (a.missed->lost & Drift::kMissed);
     status[kProblemActivation] = a.previous_status ? a.previous_status[kActivations] - missed : 0;
-    const auto write = [&](const LeftOut& out, int count, int first, int id) {
+    const auto write = [&](const Skipped& out, int count, int first, int id) {
       if (out.count == 0) return;
       const int p = INT_MAX - out.first;
       status[count] = out.count;
       status[first] = p;
       if (row > 0) status[id] = a.id ? int(a.id[p * a.id_stride]) : p;
     };
-    write(trouble.outside, kOutsideCount, kOutsideFirst, kOutsideId);
-    write(trouble.not_finite, kNonFiniteCount, kNonFiniteFirst, kNonFiniteId);
+    write(errors.outside, kOutsideCount, kOutsideFirst, kOutsideId);
+    write(errors.not_finite, kNonFiniteCount, kNonFiniteFirst, kNonFiniteId);
   }
   if (row > 0) return;
   status[kActivations]++;
@@ -460,7 +460,7 @@ __device__ void place(const ActivateArguments<T, D>& a, const Workspace& w, int6
   if (!given && i < a.slots()) a.block[i] = -1;
   if (!with_particles && i <= a.slots()) a.offsets[i] = c.transferred;
   if (i >= a.particles) return;
-  const int key = w.key[i], first = key < 0 ? -1 : w.tally[key].count, base_slot = first < 0 ? -1 : a.table[key];
+  const int key = w.key[i], first = key < 0 ? -1 : w.block_counts[key].count, base_slot = first < 0 ? -1 : a.table[key];
   schedule.base_slot[i] = base_slot;
   const int rank = w.rank[i];
   const int64_t position = first < 0 ? a.particles + first - rank : first + rank;
@@ -473,8 +473,8 @@ __device__ void place(const ActivateArguments<T, D>& a, const Workspace& w, int6
   }
 }
 
-// In place of a sort, where one kernel does all: the particle at a position goes behind those of its block that are
-// before it in memory.
+// In place of a sort, if one kernel does everything: the particle at a position goes behind those of its block that
+// precede it in memory.
 template <class T, int D>
 __device__ void put_in_order(const ActivateArguments<T, D>& a, const Workspace& w, int64_t position) {
   const int i = w.slot_sorted[position];
@@ -493,7 +493,7 @@ __device__ void put_in_order(const ActivateArguments<T, D>& a, const Workspace& 
 template <class T, int D>
 __global__ void __launch_bounds__(kThreads)
     take_back_kernel(const ActivateArguments<T, D> a, const Workspace w, int n) {
-  take_back(a, w, n);
+  clear_previous(a, w, n);
 }
 
 template <int Order, bool Marks, class T, int D>
@@ -519,8 +519,8 @@ __global__ void __launch_bounds__(kThreads) place_kernel(const ActivateArguments
   place(a, w, int64_t(blockIdx.x) * kThreads + threadIdx.x);
 }
 
-// All of it, in fresh tensors where the table has few tiles, or as the activation before has left them; or another row
-// of the status where that one lasts. The thread blocks all run at once and wait for each other.
+// The whole activation, in fresh tensors for a table of few tiles, or in those of the previous activation; or only a
+// row of the status if that activation still lasts. All thread blocks run at once and wait for each other.
 template <int Order, class T, int D>
 __global__ void __launch_bounds__(kThreads)
     activate_at_once(const ActivateArguments<T, D> a, const Workspace w, int table, int64_t rows) {
@@ -534,7 +534,7 @@ __global__ void __launch_bounds__(kThreads)
     }
     return;
   }
-  if (w.marked) take_back(a, w, table);
+  if (w.marked) clear_previous(a, w, table);
   int4* const workspace = static_cast<int4*>(a.workspace);
   for (int64_t i = start; i < (w.marked ? w.zeroed : w.zeroed_once) / int64_t(sizeof(int4)); i += stride)
     workspace[i] = {};
@@ -573,14 +573,14 @@ template <int Order, class T, int D>
 void activate(const ActivateArguments<T, D>& a, Stream stream) {
   const Workspace w = lay_out(a);
   const int table = a.scenes * a.geometry.blocks_per_scene;
-  // Of slots with their end, or of the status; and of particles.
+  // Loops over slots with their end, or rows of the status; and over particles.
   const int64_t rows = std::max(a.particles, int64_t(std::max(a.slots(), a.scenes)) + 1);
   if ((a.drift && !a.fresh) || (!w.marked && !a.deterministic)) {
     launch_at_once(activate_at_once<Order, T, D>, blocks_for(std::max<int64_t>(rows, w.marked ? 0 : table)), kThreads,
                    0, stream, a, w, table, rows);
     return;
   }
-  // Of the tiles listed no more have to run at once than the device takes.
+  // No more listed tiles have to run at once than fit on the device.
   const unsigned tiles = w.marked ? std::min(blocks_for(table), grid_size(a.slots() + 1)) : blocks_for(table);
   if (w.marked && !a.fresh)
     launch(take_back_kernel<T, D>, tiles, kThreads, 0, stream, a, w, table);

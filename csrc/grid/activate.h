@@ -13,31 +13,32 @@ struct ActivateArguments {
   Geometry<T, D> geometry;
   int scenes = 1;
   int max_blocks = 0;
-  int margin_blocks = 0;  // slots more, for blocks around those with particles that no particle touches yet
+  int margin_blocks = 0;  // further slots, for blocks around those with particles that no particle touches yet
   int64_t particles = 0;
   bool deterministic = false;
   Field<const T> x;
-  const int* scene = nullptr;  // [P] or null for one scene; kAbsent of a particle that is not there
+  const int* scene = nullptr;  // [P] or null for one scene; kAbsent for an absent particle
   int64_t scene_stride = 0;
   const int64_t* id = nullptr;  // [P] or null
   int64_t id_stride = 0;
   const int* previous_status = nullptr;  // [1 + scenes, 8] or null
   int *table = nullptr, *block = nullptr, *offsets = nullptr, *index = nullptr, *schedule = nullptr, *status = nullptr;
   int64_t schedule_size = 0;
-  const int* origin = nullptr;  // where the particles came from, whose numbers the status tells then; or null
-  int64_t* breaks = nullptr;    // on the CPU: how often one does not follow the one before it in memory, in the order
-                                // of cells; or null
-  int* used_slots = nullptr;    // on the CPU: told how many slots have a block; or null
-  // On CUDA: rows of each of two copies of x and origin, and which one counts; or null. Then the index has rows.
+  const int* origin = nullptr;  // places of the particles before a reorder, reported by the status; or null
+  int64_t* breaks = nullptr;    // on the CPU: number of particles, in the order of cells, that do not follow their
+                                // predecessor in memory; or null
+  int* used_slots = nullptr;    // on the CPU: number of slots with a block; or null
+  // On CUDA: rows of each of two copies of x and origin, and the number of the current one; or null. With copies the
+  // index contains rows.
   const int* copy = nullptr;
   int copy_rows = 0;
-  void* workspace = nullptr;  // bytes asked for by activate_workspace()
-  bool fresh = true;          // whether the table and the workspace are not those of an earlier call as they were left
+  void* workspace = nullptr;  // its size is that of activate_workspace()
+  bool fresh = true;          // whether the table and the workspace are new, not those of an earlier call
   int64_t workspace_size = 0;
-  const Drift* drift = nullptr;   // since the activation in these tensors; null for a new one in any case
-  int most_of_item = 0;           // on CUDA: particles of an item; 0 for as many as usual
-  const Drift* missed = nullptr;  // where a particle may have been missed a step ago
-  Drift* next_drift = nullptr;    // told where there is no room for all blocks around those with particles; or null
+  const Drift* drift = nullptr;   // since the activation in these tensors; null to force a new one
+  int most_of_item = 0;           // on CUDA: particles of an item; 0 for the default
+  const Drift* missed = nullptr;  // states whether the previous step may have missed a particle
+  Drift* next_drift = nullptr;    // kLost if there is no room for all blocks around those with particles; or null
 
   MPM_HD int slots() const { return max_blocks + margin_blocks; }
 };

@@ -3,7 +3,7 @@
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
 #include <cstring>
 
-#include "cpu/ones.h"
+#include "cpu/lazy_table.h"
 #endif
 
 // Finds the blocks that particles touch and groups the particles by the block of their base node.
@@ -12,17 +12,17 @@ namespace mpm {
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
 Tensor new_table(const Tensor& like, int64_t entries) {
   const int64_t bytes = entries * int64_t(sizeof(int));
-  if (void* const data = bytes < cpu::kOnes ? nullptr : cpu::take_ones(bytes))
+  if (void* const data = bytes < cpu::kLazyTable ? nullptr : cpu::allocate_lazy_table(bytes))
     return torch::stable::from_blob(data, Shape{entries}, Shape{1}, like.device(), ScalarType::Int,
-                                    [bytes](void* data) { cpu::give_back_ones(data, bytes); });
+                                    [bytes](void* data) { cpu::free_lazy_table(data, bytes); });
   Tensor table = empty_int(like, {entries});
   empty_table(table);
   return table;
 }
 
 void empty_table(Tensor& table) {
-  if (table.numel() == 0) return;     // whose memory may be none
-  constexpr int64_t grain = 1 << 16;  // entries that one thread sets sooner than it calls others
+  if (table.numel() == 0) return;     // its memory may be null
+  constexpr int64_t grain = 1 << 16;  // entries that one thread sets faster than a team
   cpu::parallel_for(
       table.numel(), grain,
       [](void* data, int64_t begin, int64_t end) {

@@ -6,7 +6,7 @@
 // An activation as the ops call it.
 namespace mpm {
 
-// What does not change from one activation of the same particles to the next.
+// Arguments that are the same for all activations of the same particles.
 template <class T, int D>
 ActivateArguments<T, D> activate_arguments(const PackedLattice& packed, const Tensor& x, const OptionalTensor& scene,
                                            const OptionalTensor& ids, int64_t scenes, int64_t max_blocks) {
@@ -33,10 +33,10 @@ ActivateArguments<T, D> activate_arguments(const PackedLattice& packed, const Te
   return a;
 }
 
-// A table for new activations. On the CPU no block has a slot yet, for which of a large table nothing is written.
+// A table for new activations. On the CPU no block has a slot yet; a large table is made without writing it.
 Tensor new_table(const Tensor& like, int64_t entries);
 
-// On the CPU, of a table in other memory.
+// The same for a table in given memory, on the CPU.
 void empty_table(Tensor& table);
 
 // The results of an activation but for its status, and its work space.
@@ -67,7 +67,7 @@ struct ActivationTensors {
     use(a, empty(x, {a.workspace_size}, ScalarType::Byte));
   }
 
-  // The arguments write here from now on, at first into a table without blocks.
+  // Makes the arguments write here; the table has no blocks at first.
   template <class T, int D>
   void use(ActivateArguments<T, D>& a, const Tensor& memory) {
     workspace = memory;

@@ -28,7 +28,7 @@ inline namespace TORCH_MPM_ISA {
 template <class T, int D>
 ActivateWorkspace activate_layout(const ActivateArguments<T, D>& a, char* start) {
   const int64_t table = int64_t(a.scenes) * a.geometry.blocks_per_scene;
-  // A slice costs a count of each slot: not more of them than the particles pay for.
+  // A slice costs a counter per slot, so the number of slices is limited by the number of particles.
   const int64_t slots = a.max_blocks < table ? a.max_blocks : table;
   const int64_t worth = 1 + 4 * a.particles / (slots + 1), threads = thread_count();
   ActivateWorkspace w;

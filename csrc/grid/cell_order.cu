@@ -3,12 +3,12 @@
 #include "cuda/launch.cuh"
 #include "grid/cell_order.h"
 
-// Orders the particles of each block by cell, so many at a time as fit in shared memory, with a stable counting sort.
+// Orders the particles of each block by cell with a stable counting sort, in parts that fit in shared memory.
 namespace mpm::cuda {
 namespace {
 
 // One thread per cell: each reads the cells of all particles, which is a broadcast from shared memory. The work item in
-// which the particles begin stands for all of them.
+// which the particles begin processes all of them.
 template <int Order, class T, int D>
 __global__ void __launch_bounds__(kBlockNodes<D>)
     cell_order_kernel(const Topology<T, D> t, const Columns<const T, D> position, int* order) {
@@ -23,7 +23,7 @@ __global__ void __launch_bounds__(kBlockNodes<D>)
     const int begin = start + whole * kItemParticles;
     if (begin >= item.z) continue;
     const int count = ::min(kItemParticles, t.offsets[item.x + 1] - begin);
-    __syncthreads();  // those before are done
+    __syncthreads();  // the part before is done
     for (int k = own; k < count; k += cells) {
       int base[D];
       T f[D];

@@ -15,10 +15,10 @@ struct ContactSplit {
   T approach;  // speed into the surface; negative when moving away
   Vector<T, D> tangential;
   T speed;  // |tangential|
-  T kept;   // part of the tangential velocity that friction leaves
+  T kept;   // remaining fraction of the tangential velocity after friction
 };
 
-// Whether friction makes a difference: it is not zero, or its derivative at zero is asked for.
+// Whether friction has an effect: it is not zero, or its derivative at zero is wanted.
 template <class T>
 MPM_HD bool has_friction(const T& friction) {
   return friction > T(0);
@@ -28,8 +28,8 @@ MPM_HD bool has_friction(const Dual<T>& friction) {
   return friction.value > T(0) || friction.derivative != T(0);
 }
 
-// Coulomb friction takes at most `friction` times the normal velocity that the contact takes. It acts under pressure
-// only: a slip surface that holds back material moving away does so without friction.
+// Coulomb friction removes at most `friction` times the normal velocity that the contact removes. It acts under
+// pressure only: a slip surface that holds back material moving away has no friction.
 template <class T, int D>
 MPM_HD ContactSplit<T, D> split_contact(const Vector<T, D>& u, const Vector<T, D>& normal, const T& friction) {
   ContactSplit<T, D> s;
@@ -45,7 +45,7 @@ MPM_HD ContactSplit<T, D> split_contact(const Vector<T, D>& u, const Vector<T, D
   return s;
 }
 
-// Relative velocity after contact. Sticky takes all of it, slip its normal component, separate the normal component
+// Relative velocity after contact. Sticky removes all of it, slip its normal component, separate the normal component
 // only where it points into the surface.
 template <class T, int D>
 MPM_HD Vector<T, D> contact_velocity(Contact kind, const Vector<T, D>& u, const Vector<T, D>& normal,

@@ -13,7 +13,7 @@ constexpr int kBlockWidth = 4;  // nodes per block and axis
 template <int D>
 constexpr int kBlockNodes = D == 2 ? 16 : 64;
 
-// dx and lower are kept as a leading part in T and its remainder, so that the distance from the base node is exact to
+// dx and lower are stored as a leading part in T and its remainder, so that the distance from the base node is exact to
 // rounding of the position itself, however far the node is from the corner.
 template <class T, int D>
 struct Geometry {
@@ -74,7 +74,7 @@ MPM_HD S distance_in_cells(const Geometry<T, D>& g, int axis, const S& x, const 
 template <int Order, class T, int D>
 MPM_HD bool locate(const Geometry<T, D>& g, const T x[D], int base[D], T f[D]) {
   bool inside = true;
-  MPM_UNROLL for (int i = 0; i < D; i++) {  // no early return: it would make each coordinate wait for the one before
+  MPM_UNROLL for (int i = 0; i < D; i++) {  // no early return: each coordinate would wait for the previous one
     const T node = base_node<Order>(g, i, x[i]);
     const bool on = on_lattice<Order>(g, i, node);
     inside = inside && on;
@@ -102,7 +102,7 @@ MPM_HD int block_coordinates(const Geometry<T, D>& g, int index, int block[D]) {
   return index;
 }
 
-// Blocks of one colour, 2^D of them, are two blocks apart, so that particles of different ones share no node.
+// Blocks of one colour, 2^D of them, are two blocks apart, so that particles of different blocks share no node.
 template <class T, int D>
 MPM_HD int block_colour(const Geometry<T, D>& g, int index) {
   int block[D], colour = 0;

@@ -8,7 +8,7 @@ namespace {
 template <int D>
 constexpr int64_t kGrain = 4096 / kBlockNodes<D>;  // slots below which a range is not split
 
-// Of a slot that no face acts on. The compiler knows it then, and takes several nodes at once.
+// A slot that no face acts on, as a constant for the compiler, so that it vectorises over the nodes.
 template <class T, int D>
 MPM_HD SlotUpdate<T, D> free_of_walls(SlotUpdate<T, D> s) {
   s.active = true;

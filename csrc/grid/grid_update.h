@@ -11,8 +11,8 @@
 
 // Node momentum to node velocity, gravity and the walls of the domain.
 //
-// A mirror makes its plane one of symmetry: node values are what the particles together with their images behind the
-// plane would give. Mass and momentum (gravity included) of a node and, reflected, of its image are summed; both nodes
+// A mirror makes its plane one of symmetry: node values are those of the particles together with their images behind
+// the plane. Mass and momentum (gravity included) of a node and, reflected, of its image are summed; both nodes
 // get the velocity of the sum, each on its side. A node on the plane is its own image and loses its normal velocity.
 namespace mpm {
 
@@ -89,7 +89,7 @@ MPM_HD bool near_wall(const Walls<T, D>& walls, const int corner[D], int face) {
   return face % 2 ? first + kBlockWidth > walls.node[face] : first <= walls.node[face];
 }
 
-// What the nodes of one slot share.
+// Values shared by the nodes of one slot.
 template <class T, int D>
 struct SlotUpdate {
   bool active;
@@ -238,8 +238,8 @@ MPM_HD NodeRow<T, D> update_node(const GridUpdateArguments<T, D>& a, const SlotU
   return {row.mass, v};
 }
 
-// The mirror that takes a component of the momentum of a lattice node, or -1 for none: that along the axis, or where
-// there is none the first that the node has an image in, whose nodes exchange it.
+// The mirror that receives a component of the momentum of a lattice node, or -1 for none: that along the axis, or
+// otherwise the first mirror in which the node has an image, since the two nodes exchange it.
 template <class T, int D>
 MPM_HD int mirror_of(const Walls<T, D>& walls, const Vector<int, D>& node, int axis) {
   int face = mirror_face(walls, axis, node[axis]);
@@ -315,14 +315,14 @@ MPM_HD Vector<T, D> shared_adjoint(const GridUpdateBackwardArguments<T, D>& b, c
   return s.walled ? walls_adjoint(b.forward.walls, lattice_node<D>(s.corner, local), free, grad, none) : grad;
 }
 
-// The same with those of impulses, which differ from image to image; `own` becomes what the node's own row gets of
-// them.
+// The same with the adjoints of impulses, which differ from image to image; `own` becomes their contribution to the
+// row of the node itself.
 template <class T, int D, class ImpulsesOf>
 MPM_HD Vector<T, D> shared_adjoint(const GridUpdateBackwardArguments<T, D>& b, const SlotUpdate<T, D>& s, int local,
                                    int64_t index, const Vector<T, D>& free, ImpulsesOf&& impulses, NodeRow<T, D>& own) {
   const GridUpdateArguments<T, D>& a = b.forward;
   Vector<T, D> sum = zero_vector<T, D>();
-  bool itself = true;  // the node comes first, which may be its own image, too
+  bool itself = true;  // the node comes first; it may be its own image
   const auto add_member = [&](int64_t member, const Vector<T, D>& sign, const Vector<int, D>& node) {
     auto on_boundaries = impulses(s.scene, member);
     Vector<T, D> grad = b.grad_updated[member].value, v, direct = zero_vector<T, D>();
@@ -346,8 +346,8 @@ MPM_HD Vector<T, D> shared_adjoint(const GridUpdateBackwardArguments<T, D>& b, c
 }
 
 // Adjoint of row `index`; `change` becomes that of the velocity change by gravity. A node and its images depend on the
-// same sum, so the adjoint of the sum is that of all of them, reflected. `impulses(scene, row)` are `NodeImpulses` of a
-// row, or `NoImpulses`.
+// same sum, so the adjoint of the sum is the sum of their adjoints, reflected. `impulses(scene, row)` are
+// `NodeImpulses` of a row, or `NoImpulses`.
 template <class T, int D, class ImpulsesOf>
 MPM_HD NodeRow<T, D> update_node_backward(const GridUpdateBackwardArguments<T, D>& b, const SlotUpdate<T, D>& s,
                                           int local, int64_t index, Vector<T, D>& change, ImpulsesOf&& impulses) {

@@ -5,9 +5,9 @@
 #include "grid/lattice_node.h"
 #include "grid/slot_sums.h"
 
-// The impulse that the material gives a boundary: at each node that a wall or obstacle slows down, mass times the
-// velocity that it takes. Of each boundary of each scene there are D numbers, the sum of these [N s], and then that of
-// their moments about the origin [N m s]: one in 2-D, a vector in 3-D. They are float64 everywhere.
+// Impulse of the material on a boundary: the sum over nodes of mass times the velocity change by the boundary. A
+// boundary of a scene has D components of the impulse [N s], and then those of its moment about the origin [N m s]: one
+// in 2-D, three in 3-D. They are float64 everywhere.
 namespace mpm {
 
 template <int D>
@@ -15,29 +15,29 @@ constexpr int kTurns = D == 2 ? 1 : 3;
 template <int D>
 constexpr int kImpulse = D + kTurns<D>;  // numbers of an impulse
 
-// Where the impulses on boundaries are that follow one another.
+// Place of the impulses on consecutive boundaries.
 template <int D>
 struct ImpulseArguments {
   double dx, lower[D];
   int scenes = 0, boundaries = 0;
-  int64_t scene_stride = 0;      // numbers from a scene to the next
-  double* sum = nullptr;         // what they are added to, of the first scene
-  const double* grad = nullptr;  // its adjoint, in the same places; backward only
-  // [max_blocks, boundaries, kImpulse], a work space for sums whose order is that of the slots; null on CUDA where they
-  // need none.
+  int64_t scene_stride = 0;      // in numbers, from a scene to the next
+  double* sum = nullptr;         // destination, for the first scene
+  const double* grad = nullptr;  // adjoint of the sum, with the same layout; backward only
+  // [max_blocks, boundaries, kImpulse], work space for sums in the order of the slots; null on CUDA if the order is
+  // arbitrary.
   double* slots = nullptr;
 
   int numbers() const { return boundaries * kImpulse<D>; }
-  // Of what slots have left there.
+  // Sums over the values of the slots.
   SlotSums<double> slot_sums(int max_blocks, int blocks_per_scene, const int* block) const {
     return {max_blocks, blocks_per_scene, block, scenes, numbers(), true, slots, sum, scene_stride};
   }
 };
 
-// For adjoints where impulses have none.
+// In place of NodeImpulses, without adjoints of impulses.
 struct NoImpulses {
   static constexpr bool wanted = false;
-  MPM_HD NoImpulses operator()(int, int64_t) const { return {}; }  // of a node, as the functions below take it
+  MPM_HD NoImpulses operator()(int, int64_t) const { return {}; }  // of a node, as for the functions below
 };
 
 inline namespace TORCH_MPM_ISA {
@@ -65,7 +65,7 @@ struct ImpulseSum {
   }
 };
 
-// What a node of mass m adds to the adjoints where boundaries take from it, each in turn, m (before - after).
+// Adjoint of the impulses m (before - after) of a node of mass m on the boundaries that act on it in turn.
 template <class T, int D>
 struct NodeImpulses {
   static constexpr bool wanted = true;
@@ -76,7 +76,7 @@ struct NodeImpulses {
   MPM_HD NodeImpulses(const ImpulseArguments<D>& arguments, int scene, const T& m)
       : a(arguments), grad(arguments.grad + scene * arguments.scene_stride), mass(m) {}
 
-  // Adjoint of an impulse on a boundary where a lattice node is: the transpose of ImpulseSum::add.
+  // Adjoint of an impulse on a boundary at a lattice node: the transpose of ImpulseSum::add.
   MPM_HD Vector<T, D> weight(int boundary, const Vector<int, D>& node) const {
     const double* const g = grad + boundary * kImpulse<D>;
     const Vector<double, D> x = lattice_position(a, node);
@@ -94,7 +94,8 @@ struct NodeImpulses {
     return result;
   }
 
-  // The adjoint of the velocity after a boundary with that of its impulse; that before it gets `mass * weight` more.
+  // The adjoint of the velocity after a boundary including that of its impulse; that of the velocity before also has
+  // `mass * weight`.
   MPM_HD Vector<T, D> take(const Vector<T, D>& weight, const Vector<T, D>& before, const Vector<T, D>& after,
                            const Vector<T, D>& grad_after) {
     mass_grad += dot(weight, before + T(-1) * after);

@@ -3,7 +3,7 @@
 #include "grid/impulse.h"
 #include "grid/topology.op.h"
 
-// Impulses on boundaries as the ops have them, float64 [B, boundaries, D + 1 or 3].
+// Impulses on boundaries as arguments of ops, float64 [B, boundaries, D + 1 or 3].
 namespace mpm {
 
 inline Tensor no_impulses(const Tensor& like, int64_t scenes, int64_t boundaries, int64_t dim) {
@@ -11,8 +11,8 @@ inline Tensor no_impulses(const Tensor& like, int64_t scenes, int64_t boundaries
   return torch::stable::zero_(sums);
 }
 
-// Those of `count` boundaries from the first of `sums`, which they are added to. Undefined `slots` get the work space
-// that they need.
+// Impulses of `count` boundaries, which are added to `sums` from boundary `first` on. Undefined `slots` become the work
+// space, if one is needed.
 template <int D>
 ImpulseArguments<D> impulse_arguments(const PackedLattice& lattice, const Tensor& sums, int64_t first, int64_t count,
                                       int64_t max_blocks, Tensor& slots) {
@@ -29,7 +29,7 @@ ImpulseArguments<D> impulse_arguments(const PackedLattice& lattice, const Tensor
   return a;
 }
 
-// Of their adjoint.
+// The same for the adjoint of the impulses.
 template <int D>
 ImpulseArguments<D> impulse_gradient(const PackedLattice& lattice, const Tensor& grad, int64_t first, int64_t count,
                                      const Shape& shape, const Tensor& like) {

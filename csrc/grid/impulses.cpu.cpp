@@ -11,7 +11,7 @@ namespace {
 
 constexpr int64_t kGrain = 64;  // slots below which a range is not split
 
-// Each slot has numbers of its own; they are added up in the order of the slots, whatever the number of threads.
+// Each slot has its own sums, which are added in the order of the slots, for any number of threads.
 template <class T, int D, class SlotImpulses>
 void add_up_impulses(const Geometry<T, D>& geometry, int max_blocks, const int* block, const ImpulseArguments<D>& a,
                      const SlotImpulses& slot_impulses) {

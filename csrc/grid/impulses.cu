@@ -18,7 +18,7 @@ __device__ Place place() {
   return {thread / kSlotLanes, int(thread % kSlotLanes)};
 }
 
-// The sum over the lanes of a slot goes to the numbers of the slot where there are such, else to the scene at once.
+// The sum over the lanes of a slot is stored for the slot, if there is a work space, or added to that of the scene.
 template <int D>
 __device__ void put(const ImpulseArguments<D>& a, int64_t slot, int lane, int scene, int boundary,
                     const ImpulseSum<D>& sum) {
@@ -81,7 +81,7 @@ __global__ void __launch_bounds__(kThreads)
 
 unsigned blocks_for(int64_t max_blocks) { return unsigned((max_blocks * kSlotLanes + kThreads - 1) / kThreads); }
 
-// Launches `kernel`, and adds up what it has left for each slot.
+// Launches `kernel`, and adds up its sums of the slots.
 template <class Kernel, class Arguments, class T, int D>
 void run(Kernel* kernel, const Arguments& arguments, const ImpulseArguments<D>& a, const Geometry<T, D>& geometry,
          int max_blocks, const int* block, Stream stream) {

@@ -5,7 +5,7 @@ namespace mpm::cuda {
 
 constexpr int kSlotLanes = 16;
 
-// The lanes of a slot are half a warp and take the same branches; the other half may take others.
+// The lanes of a slot are half a warp and take the same branches; those of the other half may differ.
 struct SumLanes {
   template <class T>
   __device__ T operator()(T x) const {

@@ -2,10 +2,11 @@
 
 #include <cstdint>
 
-// Sums of what each slot has, over the slots of each scene.
+// Sums of the values of slots, over the slots of each scene.
 namespace mpm {
 
-// sum[r, c] += values of slots [max_blocks, columns]: of those of scene r, or, in the only row, of all that are used.
+// sum[r, c] += sum of values [max_blocks, columns] over the slots of scene r, or, for a single row, over all used
+// slots.
 template <class Value>
 struct SlotSums {
   int max_blocks = 0, blocks_per_scene = 0;

@@ -2,10 +2,10 @@
 
 #include "common/host_device.h"
 
-// The status tensor, int32 [1 + B, 8], that `activate` returns and hands from step to step. Row 0 counts the particles
-// of all scenes, row 1 + b those of scene b; a particle whose scene is none of these counts in row 0 alone. First means
-// first in time, for each row by itself: once entries 1-4 and 6 of a row tell of a problem, later activations leave
-// them.
+// The status tensor, int32 [1 + B, 8], which `activate` returns and passes from step to step. Row 0 counts the
+// particles of all scenes, row 1 + b those of scene b; a particle of an invalid scene counts in row 0 only. First means
+// first in time, separately for each row: once entries 1-4 and 6 of a row report a problem, later activations do not
+// change them.
 namespace mpm {
 
 enum Status : int {
@@ -20,13 +20,13 @@ enum Status : int {
   kStatusSize = 8,
 };
 
-// Of the rows of scenes: the id of the particle at kOutsideFirst or kNonFiniteFirst, its index where there are no ids;
-// 0 where there is no such particle.
+// Entries of the rows of scenes: the id of the particle at kOutsideFirst or kNonFiniteFirst, or its index without ids;
+// 0 without such a particle.
 enum SceneStatus : int { kOutsideId = 0, kNonFiniteId = 7 };
 
 inline namespace TORCH_MPM_ISA {
 
-// A row as the previous activation left it, or as it is before the first.
+// A row after the previous activation, or before the first one.
 MPM_HD void copy_status(const int* previous, int* row) {
   constexpr int fresh[kStatusSize] = {0, 0, -1, 0, -1, 0, -1, 0};
   for (int i = 0; i < kStatusSize; i++) row[i] = previous ? previous[i] : fresh[i];

@@ -4,12 +4,12 @@
 
 #include "common/host_device.h"
 
-// Fields of some particles, all in one pass: a scene that is put in order has a dozen of them.
+// Fields of selected particles, all in one pass: a scene that is sorted has a dozen of them.
 namespace mpm {
 
 constexpr int kMostColumns = 64;
 
-// A value of each particle, whatever it stands for: its bytes are moved.
+// A value of each particle, moved as bytes.
 struct TakenColumn {
   const char* from;
   char* to;        // without gaps
@@ -50,7 +50,7 @@ struct TakenColumn {
 struct TakeArguments {
   TakenColumn column[kMostColumns];
   int columns = 0;
-  const void* particles = nullptr;  // [count], those out of range have zeros
+  const void* particles = nullptr;  // [count]; the values of those out of range are zero
   bool is_wide = false;             // of 64 bits, else 32
   int64_t rows = 0, count = 0;
 

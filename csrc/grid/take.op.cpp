@@ -1,6 +1,6 @@
 #include "grid/kernels.h"
 
-// The fields of some particles.
+// Fields of selected particles.
 namespace mpm {
 
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
@@ -24,7 +24,7 @@ void take(const TakeArguments& a, Stream) {
 
 namespace {
 
-// Takes columns as they are found, as many at a time as a call has room for.
+// Collects columns of fields, and launches the kernel when the arguments of a call are full.
 class Taker {
  public:
   Taker(const Tensor& particles, int64_t rows, backend::Stream stream) : stream_(stream) {

@@ -17,24 +17,25 @@ struct Topology {
   const int* block = nullptr;     // [max_blocks] table index of a slot, -1 where unused
   const int* offsets = nullptr;   // [max_blocks + 1] index[offsets[s], offsets[s + 1]) have their base node in slot s
   const int* index = nullptr;     // [P] particles grouped by block; those outside the grid come last
-  const int* schedule = nullptr;  // order of work, of each backend its own
+  const int* schedule = nullptr;  // order of work, specific to the backend
   int64_t schedule_size = 0;
 };
 
-constexpr int kStraysOfActivation = 2;  // times as many cost what the activation of one particle does, on CUDA
+// Cost of a particle out of its block, as a multiple of that of activating one particle, on CUDA.
+constexpr int kStraysOfActivation = 2;
 
-// Where particles are that have moved since their activation, which on CUDA may serve several steps.
+// Counters of the displacement of particles since their activation, which on CUDA may serve several steps.
 struct Drift {
-  int strays;   // particles in other blocks than they were then
-  int lost;     // whether one touches a block that is not active, or may soon: bits of Loss
-  int earlier;  // strays of the steps before, added up
+  int strays;   // particles out of the block that they had then
+  int lost;     // whether one touches, or may soon touch, a block that is not active: bits of Loss
+  int earlier;  // the same, accumulated over the previous steps
 
-  // The second one where P2G of the same kernel has already missed a particle.
+  // kMissed: P2G of the same kernel has already missed a particle.
   enum Loss : int { kLost = 1, kMissed = 2 };
 
-  // A stray costs a step more than another particle does. Once all have cost what an activation does there is a new
-  // one, so that both together are at most twice the least possible: once those counted, `strays_of_activation` times,
-  // are as many as there are particles.
+  // Particles out of their block cost more than others. A new activation follows once their accumulated cost is that of
+  // an activation, that is, once `strays_of_activation` times their count exceeds the number of particles. The total
+  // cost is then at most twice the minimum.
   MPM_HD bool lasts(int64_t particles, int strays_of_activation = kStraysOfActivation) const {
     return lost == 0 && (int64_t(earlier) + strays) * strays_of_activation <= particles;
   }
@@ -42,7 +43,7 @@ struct Drift {
 };
 
 // Entries of the schedule tensor: room for the work items of both backends, with the number of particles of each cell,
-// and for an entry for each particle (the fake kernel in torch_mpm/ops/activation.py has the same formula).
+// and an entry for each particle (the fake kernel in torch_mpm/ops/activation.py has the same formula).
 template <int D>
 int64_t schedule_size(int64_t max_blocks, int64_t particles) {
   return 16 + (8 + kBlockNodes<D> / 2) * (max_blocks + particles / 128) + particles;

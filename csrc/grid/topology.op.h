@@ -3,7 +3,7 @@
 #include "common/tensors.h"
 #include "grid/topology.h"
 
-// The lattice and the topology as the ops take them, packed by torch_mpm/grid/topology.py and unpacked here.
+// The lattice and the topology as arguments of ops, packed by torch_mpm/grid/topology.py and unpacked here.
 namespace mpm {
 
 #define MPM_LATTICE_SCHEMA "float[] lattice, int[] layout"
@@ -51,7 +51,7 @@ class PackedLattice {
   const std::vector<int64_t>& layout_;
 };
 
-// topology: table, block, offsets, index, schedule; and the scene of each particle where they have one.
+// topology: table, block, offsets, index, schedule; and the scene of each particle, if there is one.
 class PackedTopology : public PackedLattice {
  public:
   PackedTopology(const std::vector<Tensor>& topology, const std::vector<double>& lattice,
@@ -78,7 +78,7 @@ class PackedTopology : public PackedLattice {
     return int64_t(max_blocks<D>()) * kBlockNodes<D>;
   }
 
-  // The same where the dimension is not known yet.
+  // The same for a dimension that is given at run time.
   int64_t node_count(int64_t dim) const { return dim == 2 ? node_count<2>() : node_count<3>(); }
 
   const int* block_pointer(const Tensor& like) const { return int_pointer(block(), "block", like, {block().size(0)}); }

@@ -5,7 +5,7 @@
 #include "grid/grid_update.h"
 #include "grid/topology.op.h"
 
-// The walls of the domain as the ops take them.
+// The walls of the domain as arguments of ops.
 namespace mpm {
 
 #define MPM_WALLS_SCHEMA "int[] wall_kind, float[] wall_plane, float[] wall_friction"

@@ -266,7 +266,8 @@ struct FusedLaunch<Law, float, D> {
                       AdvanceGather<2, float, D, false, true, false>(a.advance), a, static_cast<Stream>(stream));
   }
 #endif
-  static void resident(const LawUpdateArguments<float, D>& law, const ResidentArguments<float, D>& a, void* stream) {
+  static void block_per_scene(const LawUpdateArguments<float, D>& law, const ResidentArguments<float, D>& a,
+                              void* stream) {
     launch_resident(LawMomentumSource<Law, float, D, false>(a.p2g, law),
                     AdvanceGather<2, float, D, false, false>(a.advance), a, static_cast<Stream>(stream));
   }

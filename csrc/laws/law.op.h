@@ -22,8 +22,8 @@ const LawKernels<T, D>& kernels_of(LawEntry& law) {
   return law.kernels<T, D>();
 }
 
-// Number of scenes for parameters: B where the call knows it; otherwise any number above the largest scene of the
-// particles. On CUDA that one is unknown without waiting for the device (see `load_parameter`).
+// Number of scenes for parameters: B if the call has it; otherwise any number above the largest scene of the particles.
+// On CUDA this number is unknown without waiting for the device (see `load_parameter`).
 class ParameterScenes {
  public:
   ParameterScenes(const OptionalTensor& scene, int64_t scenes) : scene_(scene), scenes_(scenes) {}
@@ -108,7 +108,7 @@ void limit_scenes(LawArguments<T, D>& a, size_t count) {
     if (Parameter<T>& modulus = a.parameters[k]; modulus.stride == 0 || modulus.scenes) modulus.scenes = entries;
 }
 
-// `scenes` is the number of scenes of the batch, where the call knows it.
+// `scenes` is the number of scenes of the batch, or -1 if the call does not have it.
 template <class T, int D>
 LawArguments<T, D> arguments(const LawInfo& law, const Tensor& state, const OptionalTensor& C,
                              const Tensors& parameters, const Tensors& history, const OptionalTensor& scene,

@@ -40,7 +40,7 @@ struct LawKernels {
   // Substeps of few particles, for quadratic weights and the MLS form, on CUDA 13.
   void (*persistent)(const LawUpdateArguments<T, D>&, const PersistentArguments<T, D>&, void* stream) = nullptr;
   // All substeps of small scenes, for quadratic weights and the MLS form, on CUDA.
-  void (*resident)(const LawUpdateArguments<T, D>&, const ResidentArguments<T, D>&, void* stream) = nullptr;
+  void (*block_per_scene)(const LawUpdateArguments<T, D>&, const ResidentArguments<T, D>&, void* stream) = nullptr;
   void (*tangent)(const LawTangentArguments<T, D>&, void* stream) = nullptr;
 };
 
@@ -115,7 +115,7 @@ void fill_kernels(LawEntry& entry) {
     if constexpr (requires { &K::p2g; }) kernels.p2g = &K::p2g;
     if constexpr (requires { &K::g2p2g; }) kernels.g2p2g = &K::g2p2g;
     if constexpr (requires { &K::persistent; }) kernels.persistent = &K::persistent;
-    if constexpr (requires { &K::resident; }) kernels.resident = &K::resident;
+    if constexpr (requires { &K::block_per_scene; }) kernels.block_per_scene = &K::block_per_scene;
     if constexpr (Law::twice_differentiable) kernels.double_backward = K::double_backward;
     if constexpr (Law::twice_differentiable_energy) kernels.energy_double_backward = K::energy_double_backward;
   }

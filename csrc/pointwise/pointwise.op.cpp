@@ -108,9 +108,8 @@ struct Call {
        const std::vector<double>& numbers_)
       : function(function_of(name)), dim(int(dim_)), tensors(tensors_), places(places_), numbers(numbers_) {
     STD_TORCH_CHECK(dim == 2 || dim == 3, "dim must be 2 or 3, got ", dim);
-    STD_TORCH_CHECK(!tensors.empty() && tensors.size() == places.size(),
-                    "places must tell the argument of each of the ", tensors.size(), " tensors, at least one, got ",
-                    places.size());
+    STD_TORCH_CHECK(!tensors.empty() && tensors.size() == places.size(), "places must have an entry for each of the ",
+                    tensors.size(), " tensors, at least one, got ", places.size());
     STD_TORCH_CHECK(numbers.size() == function.arguments.size(), "numbers must have ", function.arguments.size(),
                     " entries for the function ", function.name, ", got ", numbers.size());
     check_places("places", places, function.arguments.size());

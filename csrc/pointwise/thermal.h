@@ -2,11 +2,11 @@
 
 #include "pointwise/heat.h"
 
-// What laws that know their temperature add to other laws (torch_mpm/laws/thermal.py).
+// Functions that make a law depend on temperature (torch_mpm/laws/thermal.py).
 namespace mpm {
 inline namespace TORCH_MPM_ISA {
 
-// J, F, α, θ, and one to expand or zero to take the expansion off: J and F times (1 + α θ)^D and 1 + α θ, or divided.
+// J, F, α, θ, and one to apply the expansion or zero to remove it: J and F times (1 + α θ)^D and 1 + α θ, or divided.
 struct ThermalStretch {
   static constexpr const char* name = "thermal_stretch";
   static constexpr Entries arguments[] = {kScalar, kMatrix, kScalar, kScalar, kScalar};
@@ -26,7 +26,7 @@ struct ThermalStretch {
   }
 };
 
-// J^(1/D) for J > 0: of large and small J by the exponential of what is positive, which loses no digits.
+// J^(1/D) for J > 0. For large and small J by the exponential of a positive number, which loses no digits.
 template <int D, class T>
 MPM_HD T root_of_volume(const T& J) {
   if constexpr (D == 2) return sqrt(J);

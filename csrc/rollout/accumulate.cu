@@ -10,7 +10,7 @@ constexpr int kThreads = 256;
 
 unsigned blocks_for(int64_t count) { return unsigned((count + kThreads - 1) / kThreads); }
 
-// One thread has the same element of all addends, so that two may have one sum.
+// One thread adds the same element of all addends, so that two may have the same sum.
 template <class T, int D>
 __global__ void __launch_bounds__(kThreads) accumulate_kernel(const AccumulateArguments<T, D> a) {
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;

@@ -3,12 +3,12 @@
 #include "common/fields.h"
 #include "grid/slot_sums.h"
 
-// Sums over many steps, and of what FLIP blends.
+// Sums over many steps, and the blend of FLIP.
 namespace mpm {
 
 constexpr int kMostAddends = 8;
 
-// sum_i += term_i for some arrays. Two of them may have one sum.
+// sum_i += term_i for several arrays. Two terms may have the same sum.
 template <class T, int D>
 struct AccumulateArguments {
   struct Addend {
@@ -26,7 +26,7 @@ struct AccumulateArguments {
   }
 };
 
-// The clocks of scenes with time steps dt * scene_dt go on by one, in double precision for particles of every type.
+// Advances the clocks of scenes by dt * scene_dt, in double precision for particles of every type.
 template <class T, int D>
 struct AdvanceClocksArguments {
   double* time = nullptr;       // [scenes]
@@ -44,7 +44,7 @@ struct AddScaledArguments {
   double share = 1;
 };
 
-// Values of slots [max_blocks, D] to sums of the blocks [block_count, D] that the slots have.
+// Adds values of slots [max_blocks, D] to the sums [block_count, D] of their blocks.
 template <class T, int D>
 struct AccumulateSlotsArguments {
   int max_blocks = 0, block_count = 0;
@@ -53,7 +53,7 @@ struct AccumulateSlotsArguments {
   T* sum = nullptr;
 };
 
-// Sums over slots, as a call asks the backend for them.
+// Sums over slots, as arguments of the backend.
 template <class T, int D>
 struct SumSlotsArguments {
   SlotSums<T> sums;

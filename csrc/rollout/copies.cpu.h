@@ -10,12 +10,12 @@ inline namespace TORCH_MPM_ISA {
 
 static_assert(kCopyLine >= kChunk + kRegisterBytes / int(sizeof(float)));
 
-// Particles `first`, ... that follow each other in memory and in the order of cells, from place `at` of the chunk on.
+// Particles `first`, ... that are consecutive in memory and in the order of cells, from place `at` of the chunk on.
 struct Stretch {
   int first, at, count;
 };
 
-// Copies `count` values. Of the `room` places from the first on, those that come later may be written over.
+// Copies `count` values. Places after these, up to `room` from the first one, may be overwritten.
 template <class T>
 MPM_HD void copy(const T* from, T* to, int count, [[maybe_unused]] int room) {
 #ifdef __AVX512VL__
@@ -35,7 +35,7 @@ MPM_HD void copy(const T* from, T* to, int count, [[maybe_unused]] int room) {
 #endif
 }
 
-// The particles of a chunk, or some that are outside, copied in the order of cells.
+// Particles of a chunk, or particles outside, copied in the order of cells.
 template <class T, int D>
 class Copies {
  public:
@@ -46,7 +46,8 @@ class Copies {
   T* row(int r) const { return rows_ + r * kCopyLine; }
   Field<const T> field(int r, int inner = D) const { return {row(r), {1, inner * kCopyLine, kCopyLine}}; }
 
-  // Those at a place of the index, in the order of a chunk if there is one; the place and number of what comes next.
+  // Copies the particles at a place of the index, in the order of a chunk, if given. `next` and `next_count` are the
+  // place and number of the particles of the next call.
   void fetch(int position, int count, int next, int next_count, const Chunk* order) {
     position_ = position;
     count_ = count;
@@ -57,7 +58,7 @@ class Copies {
     find_rows();
   }
 
-  // Those from a place on in memory, with rows of their affine fields.
+  // Copies consecutive particles from a place in memory on, with given rows of their affine fields.
   void fetch_run(int position, int count, const T* affine, int line) {
     position_ = position;
     count_ = count;
@@ -67,11 +68,11 @@ class Copies {
     for (int k = 0; k < D * D; k++) given_[R::C + k] = affine + k * line;
   }
 
-  // Asks for the cache lines of the i-th particle of what is copied next, while there is other work. It may lie
-  // elsewhere, even beyond the end of a tensor: nothing is read. (GCC leaves out calls of functions that do no more.)
-  MPM_HD void expect(int i) const {
+  // Prefetches the cache lines of the i-th particle of the next call. The address may be wrong, even beyond the end of
+  // a tensor, since nothing is read. (GCC removes calls of functions that only prefetch, unless they are inlined.)
+  MPM_HD void prefetch(int i) const {
     if (i >= next_count_) return;
-    for (int k = 0; k < a_.expected_count; k++) __builtin_prefetch(a_.expected[k] + (next_first_ + i), 0, 2);
+    for (int k = 0; k < a_.prefetched_count; k++) __builtin_prefetch(a_.prefetched[k] + (next_first_ + i), 0, 2);
     for (int k = 0; a_.rearranges && k < a_.row_count; k++) __builtin_prefetch(a_.rows[k].to + next_ + i, 1, 2);
   }
 
@@ -81,13 +82,13 @@ class Copies {
     return group_of<N>(id_ + i, count_ - i);
   }
 
-  // Stress, and what return maps change.
+  // Evaluates stress and return maps.
   void apply_laws() {
     const int* const material = a_.has_material ? numbers_[kMaterialRow] : nullptr;
     bool mixed = false;
     for (int i = 1; material && i < count_; i++) mixed |= material[i] != material[0];
     const int only = material && !mixed ? material[0] : -1;
-    if (mixed || (material && (only < 0 || only >= a_.material_count))) {  // some may have no law
+    if (mixed || (material && (only < 0 || only >= a_.material_count))) {  // some particles may have no law
       for (int k = 0; k < D * D; k++) __builtin_memset(row(R::stress + k), 0, count_ * sizeof(T));
     }
     for (int k = 0; k < a_.law_count; k++) {
@@ -98,7 +99,7 @@ class Copies {
     }
   }
 
-  // What goes elsewhere, or has changed.
+  // Writes the rows that change, or that change places.
   void leave() const {
     for (int k = 0; k < a_.row_count; k++) {
       const ParticleRow<T>& r = a_.rows[k];
@@ -106,7 +107,7 @@ class Copies {
       if (r.row >= 0)
         put(r, row(r.row));
       else
-        get(r, r.to + position_, count_);  // which changes places
+        get(r, r.to + position_, count_);  // only changes places
     }
     for (int k = 0; k < a_.number_count; k++)
       if (a_.numbers[k].to) put(a_.numbers[k], numbers_[a_.numbers[k].row]);
@@ -137,7 +138,7 @@ class Copies {
     for (int k = 0; k < a_.number_count; k++) get(a_.numbers[k], numbers_[a_.numbers[k].row], kCopyLine);
   }
 
-  // Rows that laws only read stay where they are if the particles lie one after another.
+  // Rows that laws only read are not copied if the particles are consecutive in memory.
   void find_row(const ParticleRow<T>& r) {
     if (r.row < 0) return;
     const bool stays = r.row < R::rest && !r.to && r.stride == 1 && stretches_ == 1;
@@ -145,7 +146,7 @@ class Copies {
     if (!stays) get(r, row(r.row), kCopyLine);
   }
 
-  // D x D rows from r on, as they are given.
+  // D x D rows from r on, where they are read.
   Field<const T> given(int r) const { return {given_[r], {1, given_[r + D] - given_[r], given_[r + 1] - given_[r]}}; }
 
   template <class E>
@@ -195,7 +196,7 @@ class Copies {
   Stretch stretch_[kChunk + 1];
 };
 
-// The laws act on particles outside of the grid, too.
+// Evaluates the laws for particles outside the grid.
 template <class T, int D>
 void laws_outside(const LawsP2GArguments<T, D>& a, int first) {
   const int last = int(a.p2g.topology.particles), pieces[2] = {0, (last - first + kChunk - 1) / kChunk};

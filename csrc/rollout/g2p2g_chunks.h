@@ -6,21 +6,21 @@
 
 // G2P of a substep and laws and P2G of the next one in one pass over the particles, on the CPU, while an activation
 // lasts (G2P2G: Wang et al. 2020, "A massively parallel and scalable multi-GPU material point method"). Velocities and
-// affine fields stay in the caches, and the particles of a chunk where they are in memory, one after another.
+// affine fields stay in the caches; the particles of a chunk stay in place, consecutive in memory.
 namespace mpm {
 
 template <class T, int D>
 struct G2P2GChunksArguments {
-  G2PAdvanceArguments<T, D> advance;  // x, F and J in place, with unit strides; v and C are written if nothing follows
-  LawsP2GArguments<T, D> to_nodes;    // of the positions that G2P has found; rearranges nothing
-  const NodeRow<T, D>* velocities = nullptr;  // rows of the pool before
-  NodeRow<T, D>* sums = nullptr;              // and after
-  bool follows = false;                       // laws and P2G
-  bool fresh = false;  // whether this is the first pass since the activation, which has left particles in order
+  G2PAdvanceArguments<T, D> advance;  // x, F and J in place, with unit strides; v and C are written in the last pass
+  LawsP2GArguments<T, D> to_nodes;    // at the new positions; without a reorder
+  const NodeRow<T, D>* velocities = nullptr;  // node velocities of the previous substep
+  NodeRow<T, D>* sums = nullptr;              // node sums of the next one
+  bool follows = false;                       // whether laws and P2G follow
+  bool fresh = false;                         // whether this is the first pass since the activation
 };
 
-// The longest way along an axis that nodes go in the time step of their scene, as a multiple of dt; infinite if one is
-// not finite.
+// Longest displacement of a node along an axis in the time step of its scene, as a multiple of dt; infinite if a
+// velocity is not finite.
 template <class T, int D>
 struct LongestMoveArguments {
   const NodeRow<T, D>* nodes = nullptr;  // with velocities

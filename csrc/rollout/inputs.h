@@ -58,7 +58,7 @@ namespace mpm {
   X(INTS, layout, lattice_layout)               \
   X(CHOICE, schedule, schedule)
 
-// Of each kind what the schema calls it, and the type of a member.
+// For each kind its name in the schema, and the type of a member.
 #define MPM_SCHEMA_TENSOR(name) "Tensor " #name
 #define MPM_SCHEMA_OPTIONAL(name) "Tensor? " #name
 #define MPM_SCHEMA_TENSORS(name) "Tensor[] " #name
@@ -116,11 +116,11 @@ struct LawCall {
   bool adds;  // to the stress of another law of the material
   int64_t options;
   Tensors parameters, history;
-  int64_t first_column;  // of the history of all laws
+  int64_t first_column;  // in the history of all laws
 };
 
-// The materials are parted by commas, and their laws by '+'. `variables` are the numbers of history tensors: a law may
-// go without.
+// Materials are separated by commas, and the laws of a material by '+'. `variables` are the numbers of history tensors,
+// which may be zero.
 inline std::vector<LawCall> law_calls(const std::string& names, const std::vector<int64_t>& options,
                                       const Tensors& parameters, const Tensors& history,
                                       const std::vector<int64_t>& variables, int64_t dim) {
@@ -162,7 +162,7 @@ inline std::vector<LawCall> law_calls(const std::string& names, const std::vecto
   return calls;
 }
 
-// Where the fields of the particles are; absent where a simulation has none.
+// Fields of the particles; absent ones are empty.
 template <class T>
 struct Particles {
   Field<T> x, v, C, F, J, residual;
@@ -201,7 +201,7 @@ inline Tensor packed_history(const Tensor& x, const Tensors& history, int64_t co
   return packed;
 }
 
-// A history variable from a column of all entries on: [P], or [P, D, D].
+// A history variable, from a column of the packed history on: [P], or [P, D, D].
 template <class T, int D>
 Field<T> variable(const Field<T>& history, int64_t first, bool matrix) {
   Field<T> f = history;
@@ -211,7 +211,7 @@ Field<T> variable(const Field<T>& history, int64_t first, bool matrix) {
   return f;
 }
 
-// The material of each particle, where there are several.
+// Checks the material of each particle, if there are several.
 inline void check_material(const OptionalTensor& material, const std::vector<LawCall>& calls, const Tensor& x) {
   STD_TORCH_CHECK(has(material) || calls.back().material == 0, "several laws need material");
   if (!has(material)) return;
@@ -234,7 +234,7 @@ LawArguments<T, D> law_arguments(const LawCall& call, const Tensor& x, const Opt
   return a;
 }
 
-// Where a law finds its history: in columns from `first` on.
+// Sets the history of a law, in columns from `first` on.
 template <class T, int D>
 void set_history(LawArguments<T, D>& a, const LawCall& call, const Field<const T>& history, int64_t first) {
   for (size_t k = 0; k < call.history.size(); k++) {

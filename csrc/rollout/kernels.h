@@ -18,19 +18,19 @@
 MPM_BACKEND_KERNELS(MPM_ROLLOUT_KERNELS)
 
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
-#define MPM_OWN_PARTICLES_KERNELS(PLAIN, ORDERED, SIZE) \
-  ORDERED(laws_p2g, LawsP2GArguments)                   \
-  PLAIN(g2p2g_chunks, G2P2GChunksArguments)             \
-  PLAIN(longest_move, LongestMoveArguments)             \
+#define MPM_SORTED_CPU_KERNELS(PLAIN, ORDERED, SIZE) \
+  ORDERED(laws_p2g, LawsP2GArguments)                \
+  PLAIN(g2p2g_chunks, G2P2GChunksArguments)          \
+  PLAIN(longest_move, LongestMoveArguments)          \
   PLAIN(permute, PermuteArguments)
-MPM_BACKEND_KERNELS(MPM_OWN_PARTICLES_KERNELS)
+MPM_BACKEND_KERNELS(MPM_SORTED_CPU_KERNELS)
 #endif
 
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda
 namespace mpm::cuda {
 // times[k + 1] = times[k] + dt, on the device.
 void add_up_times(double* times, double first, double dt, int64_t count, Stream stream);
-void resident_status(const ResidentStatusArguments& a, Stream stream);
+void block_per_scene_status(const BlockPerSceneStatusArguments& a, Stream stream);
 // The bits of the largest absolute value of `count` numbers; zero where there is none.
 void find_largest(const Field<const float>& numbers, int64_t count, int* bits, Stream stream);
 template <class T, int D>

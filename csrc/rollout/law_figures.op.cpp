@@ -1,6 +1,6 @@
 #include "rollout/inputs.h"
 
-// What a survey asks of the laws: stress, tangent modulus and energy of all particles, each by its own law.
+// Values of the laws for a survey: stress, tangent modulus and energy of each particle, by its own law.
 namespace mpm {
 namespace {
 
@@ -11,7 +11,7 @@ struct FiguresInputs {
 };
 
 struct Figures {
-  Tensor stress, stiffness, energy;  // energy where it is wanted
+  Tensor stress, stiffness, energy;  // energy if wanted
 };
 
 template <class T, int D>
@@ -31,8 +31,8 @@ void figures_of(const FiguresInputs& in, const LawCall& call, Figures& out, back
   if (call.law->info.plastic) a.state = field<T>(mapped = empty_particles(in.x, {in.x.size(0), D, D}));
   const int64_t columns = history_size(call.law->info, call.history, D);
   if (columns > 0) a.history = field<T>(moved = empty_particles(in.x, {in.x.size(0), columns}));
-  // The lanes of a pack that are of other laws are read, too, and a decomposition ends when all lanes are done: what
-  // was in memory must not decide how a member is rounded.
+  // Lanes of a pack with particles of other laws are read too, and a decomposition ends when all lanes have converged:
+  // old contents of memory must not affect the rounding of a member.
   for (Tensor* t : {&mapped, &moved})
     if (t->defined() && in.x.is_cpu() && has(in.material)) torch::stable::zero_(*t);
   kernels.update(a, stream);
@@ -56,12 +56,12 @@ std::tuple<Tensor, Tensor, Tensor> law_figures(const Tensor& x, const OptionalTe
   const FiguresInputs in{x, C, F, J, scene, material};
   Figures out{empty_particles(x, {P, D, D}), empty_particles(x, {P}), energy ? empty_particles(x, {P}) : Tensor()};
   const DeviceScope device(x);
-  if (has(material)) {  // of no law
+  if (has(material)) {  // particles without a law
     for (Tensor* t : {&out.stress, &out.stiffness, &out.energy})
       if (t->defined()) torch::stable::zero_(*t);
   }
   dispatch(x, [&]<class T, int Dim>() {
-    input<T>(C, "C", x, {P, Dim, Dim});  // also where no law reads it
+    input<T>(C, "C", x, {P, Dim, Dim});  // checked also if no law reads it
     input<T>(F, "F", x, {P, Dim, Dim});
     input<T>(J, "J", x, {P});
     for (const LawCall& call : calls) figures_of<T, Dim>(in, call, out, device.stream());

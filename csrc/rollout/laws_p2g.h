@@ -3,9 +3,9 @@
 #include "laws/law.h"
 #include "transfer/arguments.h"
 
-// Laws and P2G of a substep in one pass over the particles, on the CPU: what laws read of a chunk of particles is
-// copied row by row in the order of its cells, the stress is computed there, and what the particles give to the nodes
-// is summed up. On the way particles may change places in memory, so that they lie in the order of their cells.
+// Laws and P2G of a substep in one pass over the particles, on the CPU. The rows that laws read of a chunk of particles
+// are copied in the order of its cells, the stress is computed on the copy, and the contributions to the nodes are
+// added. In the same pass the particles may be reordered in memory by cell.
 namespace mpm {
 
 // A component of a field of the particles.
@@ -13,55 +13,58 @@ template <class T>
 struct ParticleRow {
   const T* from = nullptr;
   int64_t stride = 0;
-  T* to = nullptr;  // with stride 1; null where it stays
-  int row = -1;     // of the copy; -1 where laws do not read it
+  T* to = nullptr;  // with stride 1; null if it is not written
+  int row = -1;     // of the copy; -1 if laws do not read it
 };
 
-constexpr int kCopyLine = 1024 + 16;  // of a row: kChunk, and room for a whole register at the end; no power of two
+constexpr int kCopyLine =
+    1024 + 16;  // length of a row: kChunk, and room for a whole register at the end; no power of two
 
-// The rows of the copy of a chunk; after these the history of all laws, and parameters that particles have.
+// The rows of the copy of a chunk, followed by the history of all laws and the parameters per particle.
 template <int D>
 struct ChunkRows {
   static constexpr int stress = 0, F = stress + D * D, J = F + D * D, C = J + 1, rest = C + D * D;
 };
 
-// Of int.
+// Rows of integers.
 enum ChunkNumbers : int { kOriginRow, kSceneRow, kMaterialRow, kNumberRows };
 
 template <class T, int D>
 struct ChunkLaw {
   void (*update)(const LawUpdateArguments<T, D>&, void* stream) = nullptr;
-  LawUpdateArguments<T, D> arguments;  // of which the parameters that particles share are used
+  LawUpdateArguments<T, D> arguments;  // only the parameters shared by all particles are used
   bool gradient = false, viscous = false, plastic = false;
   int material = 0;
-  int history[kMostHistory], parameters[kMostParameters];  // their rows, -1 where there are none
+  int history[kMostHistory], parameters[kMostParameters];  // their rows, -1 for none
   bool matrix[kMostHistory] = {};
 };
 
-// Of all particles, after a P2G.
+// Displacement of all particles, after a P2G.
 struct Whereabouts {
-  float slack;  // cells that every particle can go, on each axis, while the activation still serves it
-  int strays;   // particles in other blocks than they were in when they were activated
+  float displacement_budget;  // displacement budget: cells that every particle can move on each axis within the
+                              // activation
+  int strays;                 // particles out of the block of their activation
 };
 
 template <class T, int D>
 struct LawsP2GArguments {
-  P2GArguments<T, D> p2g;                // its stress is not used
-  const ParticleRow<T>* rows = nullptr;  // what laws read, or what is written
+  P2GArguments<T, D> p2g;                // without its stress
+  const ParticleRow<T>* rows = nullptr;  // rows that laws read, or that are written
   int row_count = 0;
-  const T* const* expected = nullptr;  // rows of stride 1 that are read
-  int expected_count = 0;
-  const ParticleRow<int>* numbers = nullptr;  // origin, scene and material, those that there are
+  const T* const* prefetched = nullptr;  // rows of stride 1 to prefetch
+  int prefetched_count = 0;
+  const ParticleRow<int>* numbers = nullptr;  // origin, scene and material, if present
   int number_count = 0;
   bool has_material = false, has_C = false;
   const ChunkLaw<T, D>* laws = nullptr;
   int law_count = 0, material_count = 0;
-  // Whether particle i of the index goes to place i; index and schedule are written anew then.
+  // Whether particle i of the index is written to place i; index and schedule are then rewritten.
   bool rearranges = false;
   int *index = nullptr, *schedule = nullptr;
   T* copies = nullptr;  // [threads, copy_size]
   int64_t copy_size = 0;
-  Whereabouts* whereabouts = nullptr;  // gets the least slack and the sum of strays, where an activation may last
+  Whereabouts* whereabouts =
+      nullptr;  // receives the least budget and the number out of block, if the activation may last
 };
 
 // Rows of one length, from[order[i]] to to[i].

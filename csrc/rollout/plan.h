@@ -53,30 +53,30 @@ struct PlanFacts {
 
 // ---- thresholds
 
-constexpr int64_t kMostSteps = 1 << 16;  // of one call, which nothing interrupts
+constexpr int64_t kMostSteps = 1 << 16;  // of one call
 
-// A block per scene. Where scenes are larger than that on average, or their domains, kernels of whole grids take them.
+// Block per scene. Larger scenes on average, or larger domains, are computed by kernels over the whole grid.
 template <int D>
-constexpr int kMostResidentParticles = D == 2 ? 4096 : 2304;
-constexpr int kMostResidentBlocks = 4096;
-constexpr int64_t kLeastResidentSteps = 4;
+constexpr int kMostSceneParticles = D == 2 ? 4096 : 2304;
+constexpr int kMostSceneBlocks = 4096;
+constexpr int64_t kLeastSceneSteps = 4;
 
-// Fused G2P2G. Fewer particles are faster by kernels of their own: those that find nothing to do cost more than half of
-// the bytes.
-constexpr int64_t kLeastMergedSteps = 4, kLeastMergedParticles = 1 << 18;
-// Particles that P2G moves in place, without G2P2G: not of those that caches do not hold, which drift apart, where G2P
-// can go in the order of memory and P2G cannot.
+// Fused G2P2G. Fewer particles are faster with separate kernels: the launches without work cost more than half of the
+// bytes.
+constexpr int64_t kLeastFusedSteps = 4, kLeastFusedParticles = 1 << 18;
+// Particles whose F or J is updated by P2G, without G2P2G. More particles exceed the caches and lose their order, and
+// then G2P can pass over them in the order of memory, but P2G cannot.
 constexpr int64_t kMostLateParticles = 1 << 18;
 
-// Persistent. A deterministic grid, or a pool of fixed size, takes half as many particles.
+// Persistent. For a deterministic grid, or a pool of fixed size, half as many particles.
 constexpr int64_t kLeastPersistentSteps = 10, kMostPersistentParticles = 1 << 15, kMostPersistentBlocks = 256;
-// Particles of an item at most, which have a thread each: more where there are more particles, so that one wave of
-// thread blocks is enough for all items.
+// Largest number of particles of an item, with a thread each. It grows with the number of particles, so that one wave
+// of thread blocks suffices for all items.
 template <int D>
 constexpr int persistent_item(int64_t particles) {
   return D == 2 ? 192 : particles <= 11000 ? 128 : particles <= 20000 ? 256 : 384;
 }
-// Of a domain, and of work in a step, for which about one wave of thread blocks is enough.
+// Blocks of a domain, and items of a step, for which about one wave of thread blocks suffices.
 constexpr int64_t kFewBlocks = 1 << 12;
 template <int D>
 constexpr int kFewItems = D == 2 ? 250 : 140;
@@ -98,18 +98,20 @@ constexpr int64_t kLeastSortedSteps = 64, kLeastSortedParticles = 1 << 15;
 
 // Whether a block per scene is faster than kernels of whole grids, by times measured on an H200 [µs].
 template <int D>
-bool resident_pays(int64_t particles, int64_t scenes) {
-  if (scenes == 1) return particles <= 96;  // else a kernel with many thread blocks is (rollout/schedules/persistent.h)
+bool block_per_scene_pays(int64_t particles, int64_t scenes) {
+  if (scenes == 1)
+    return particles <= 96;  // otherwise a kernel with many thread blocks (rollout/schedules/persistent.h)
   const double turns = std::fmax(1, double(scenes) / 132), size = double(particles) / double(scenes);
-  const double resident = 8 + turns * (2.5 + (D == 2 ? 0.019 : 0.021) * size);
+  const double per_scene = 8 + turns * (2.5 + (D == 2 ? 0.019 : 0.021) * size);
   const double together = 14 + double(particles) / 3500 + 0.07 * double(scenes);
-  return resident < together;
+  return per_scene < together;
 }
 
 // Estimated number of items of a step with a pool of `blocks` (rollout/schedules/persistent.h).
 inline double items_of_step(const PlanFacts& f, int64_t blocks) {
-  const double active = double(blocks) / 1.5;                                // of a pool that has grown
-  if (f.dim == 2) return std::max(0.8 * active, double(f.particles) / 150);  // most have particles, seldom two items
+  const double active = double(blocks) / 1.5;  // active blocks of a pool that has grown
+  if (f.dim == 2)
+    return std::max(0.8 * active, double(f.particles) / 150);  // most blocks have particles, few have two items
   return 0.5 * active + double(f.particles) / (1.25 * persistent_item<3>(f.particles));
 }
 
@@ -118,10 +120,10 @@ inline double items_of_step(const PlanFacts& f, int64_t blocks) {
 enum Schedule : int64_t {
   kChoose = -1,
   kPerStep,        // kernel by kernel
-  kFusedG2P2G,     // G2P and the next P2G in one kernel, of particles that the call owns (CUDA)
-  kPersistent,     // one kernel of thread blocks that all run at once (CUDA)
-  kBlockPerScene,  // a thread block takes a scene through all substeps (CUDA)
-  kSortedCpu       // particles lie in the order of their cells; G2P and the next P2G in one pass (CPU)
+  kFusedG2P2G,     // G2P and the next P2G in one kernel; the call owns the particles (CUDA)
+  kPersistent,     // one kernel, whose thread blocks all run at once (CUDA)
+  kBlockPerScene,  // a thread block computes all substeps of a scene (CUDA)
+  kSortedCpu       // particles sorted by cell; G2P and the next P2G in one pass (CPU)
 };
 
 // Each function returns the reason against the schedule, or an empty text.
@@ -129,7 +131,7 @@ struct ScheduleEntry {
   Schedule schedule;
   const char* name;
   std::string (*unsupported)(const PlanFacts&);
-  std::string (*unprofitable)(const PlanFacts&);  // of a call that is supported
+  std::string (*unprofitable)(const PlanFacts&);  // for a supported call
 };
 
 // Whether sums of nodes are independent of the order of their terms, in deterministic mode on CUDA. Only without
@@ -180,15 +182,16 @@ inline std::string unsupported(const PlanFacts& f) {
   if (f.impulses) return "impulses are accumulated";
   if (f.gradients) return "gradients are wanted";
   if (f.particles == 0) return "there are no particles";
-  if (f.steps < kLeastResidentSteps) return "a call has fewer than " + count(kLeastResidentSteps, "steps");
-  const int64_t most = f.dim == 2 ? kMostResidentParticles<2> : kMostResidentParticles<3>;
+  if (f.steps < kLeastSceneSteps) return "a call has fewer than " + count(kLeastSceneSteps, "steps");
+  const int64_t most = f.dim == 2 ? kMostSceneParticles<2> : kMostSceneParticles<3>;
   if (f.particles > most * f.scenes) return "scenes have more than " + count(most, "particles on average");
-  if (f.blocks_per_scene > kMostResidentBlocks) return "a domain has more than " + count(kMostResidentBlocks, "blocks");
+  if (f.blocks_per_scene > kMostSceneBlocks) return "a domain has more than " + count(kMostSceneBlocks, "blocks");
   return {};
 }
 inline std::string unprofitable(const PlanFacts& f) {
   if (f.deterministic && !sums_are_fixed(f)) return {};
-  const bool pays = f.dim == 2 ? resident_pays<2>(f.particles, f.scenes) : resident_pays<3>(f.particles, f.scenes);
+  const bool pays =
+      f.dim == 2 ? block_per_scene_pays<2>(f.particles, f.scenes) : block_per_scene_pays<3>(f.particles, f.scenes);
   return pays ? "" : "kernels of whole grids are faster for scenes of this number and size";
 }
 }  // namespace block_per_scene
@@ -200,11 +203,11 @@ inline std::string unsupported(const PlanFacts& f) {
   if (!f.uniform_parameters) return "a parameter has more than one value";
   if (f.particles == 0) return "there are no particles";
   if (f.particles > INT32_MAX / 2) return "there are more than 2^30 particles";
-  if (f.steps < kLeastMergedSteps) return "a call has fewer than " + count(kLeastMergedSteps, "steps");
+  if (f.steps < kLeastFusedSteps) return "a call has fewer than " + count(kLeastFusedSteps, "steps");
   return {};
 }
 inline std::string unprofitable(const PlanFacts& f) {
-  return f.particles < kLeastMergedParticles ? "there are fewer than " + count(kLeastMergedParticles, "particles") : "";
+  return f.particles < kLeastFusedParticles ? "there are fewer than " + count(kLeastFusedParticles, "particles") : "";
 }
 }  // namespace fused_g2p2g
 
@@ -219,9 +222,9 @@ inline std::string unsupported(const PlanFacts& f) {
   if (!f.graph_loops) return "the device runs no CUDA graphs with loops";
   return {};
 }
-// It pays where one wave of thread blocks is enough for all items, as where the pool is small; one that grows and has
-// room for all blocks is meant for it (`pool_for`). Of deterministic grids this must not depend on how far a pool has
-// grown that was not meant for it.
+// It pays if one wave of thread blocks suffices for all items. Pools with this property are small, or grow and were
+// given room for all blocks by `pool_for`. On deterministic grids the choice must not depend on the growth of another
+// pool.
 inline std::string unprofitable(const PlanFacts& f) {
   if (f.grows && f.max_blocks < 0) return "the size of the pool is not known before the first activation";
   if (f.grows && f.max_blocks != f.blocks()) return "the pool has no room for all blocks of the domain";
@@ -240,7 +243,7 @@ inline std::string unsupported(const PlanFacts& f) {
 inline std::string unprofitable(const PlanFacts& f) { return f.steps < 2 ? "there is no step after the first" : ""; }
 }  // namespace sorted_cpu
 
-// The first supports every call.
+// The first one supports every call.
 constexpr ScheduleEntry kSchedules[] = {
     {kPerStep, "per_step", nothing, nothing},
     {kFusedG2P2G, "fused_g2p2g", fused_g2p2g::unsupported, fused_g2p2g::unprofitable},
@@ -260,8 +263,8 @@ inline Schedule choose_schedule(const PlanFacts& facts) {
 // ---- pools
 
 struct PlannedPool {
-  int64_t blocks;  // for which the pool has room at least, or -1: it follows the scene, or is the one that was given
-  int64_t steps;   // of a call at most
+  int64_t blocks;  // least size of the pool, or -1: it follows the scene, or is fixed
+  int64_t steps;   // largest number of steps of a call
 };
 
 // Whether the persistent schedule pays if the pool has all blocks of the domain.
@@ -273,9 +276,9 @@ inline bool takes_few_blocks(const PlanFacts& f) {
 }
 
 // The pool and the steps of a call. A pool with all blocks of the domain never has to grow: for few blocks with the
-// persistent schedule, or where the particles need more memory. A larger pool is looked at less often, unless kernels
-// pass over all of its blocks. On deterministic grids the choice is independent of the number of blocks so far, since a
-// second run must equal the first bit by bit.
+// persistent schedule, or if the particles need more memory. The size of a larger pool is checked less often, unless
+// kernels pass over all of its blocks. On deterministic grids the choice is independent of the number of blocks so far,
+// since a second run must equal the first bit by bit.
 inline PlannedPool pool_for(const PlanFacts& f) {
   if (!f.cuda) return {-1, kMostSteps};
   if (!f.grows) {
@@ -283,7 +286,7 @@ inline PlannedPool pool_for(const PlanFacts& f) {
     return {-1, std::clamp(most, kLeastStepsOfCall, kMostSteps)};
   }
   if (f.gradients) return {-1, kGrowingSteps};
-  const int64_t room = f.particles >= kLeastMergedParticles ? f.particles / kParticlesPerBlock : 0;
+  const int64_t room = f.particles >= kLeastFusedParticles ? f.particles / kParticlesPerBlock : 0;
   if (room >= f.blocks() || takes_few_blocks(f)) return {f.blocks(), kWholeSteps};
   const bool passes = f.deterministic || f.mirrors || f.flips;
   const int64_t times = f.max_blocks < 0 || passes ? 0 : room / std::max<int64_t>(kRoomy * f.max_blocks, 1);
@@ -294,14 +297,14 @@ inline PlannedPool pool_for(const PlanFacts& f) {
 // Order of unsorted particles.
 enum Order : int64_t {
   kAsGiven,
-  kSortedBefore,  // sorted before the call, and put back after it
-  kSortedByCall   // by the schedule
+  kSortedBefore,  // sorted before the call, restored after it
+  kSortedByCall   // sorted by the schedule
 };
 
 inline Order order_for(const PlanFacts& f) {
   if (!f.cuda || f.captured || f.sorted || f.steps < kLeastSortedSteps || f.particles < kLeastSortedParticles)
     return kAsGiven;
-  const bool itself = f.particles >= kLeastMergedParticles && !f.scene_ids && !f.gradients;
+  const bool itself = f.particles >= kLeastFusedParticles && !f.scene_ids && !f.gradients;
   return itself && why_not_many_phases(f).empty() ? kSortedByCall : kSortedBefore;
 }
 

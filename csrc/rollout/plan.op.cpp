@@ -2,7 +2,7 @@
 
 #include <tuple>
 
-// Plans of calls of `substeps`, without particles: of every device, whatever was compiled.
+// Plans of calls of `substeps`, without particles, for every device, also one without compiled kernels.
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
 namespace mpm {
 namespace {

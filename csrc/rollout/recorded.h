@@ -3,11 +3,11 @@
 #include "common/signals.h"
 #include "rollout/step_kernels.h"
 
-// n steps with what their adjoint reads of each: the particles, and the active blocks and nodes where these take less
-// memory than the particles do.
+// n steps with a record of the inputs of their adjoints: the particles of each step, and its active blocks and nodes if
+// these need less memory than the particles.
 namespace mpm {
 
-// Pieces of one tensor of bytes, one after another; only counted where there is none yet.
+// Consecutive pieces of one tensor of bytes; without a tensor the bytes are only counted.
 class Arena {
  public:
   Arena() = default;
@@ -41,11 +41,11 @@ class Arena {
   int64_t size_ = 0;
 };
 
-// A field of the particles at many steps, structures of arrays one after another.
+// A field of the particles at many steps, as consecutive structures of arrays.
 template <class T>
 class Record {
  public:
-  Record() = default;  // of an absent field
+  Record() = default;  // for an absent field
   Record(Arena& arena, const Tensor& x, int64_t steps, int64_t rows = 1, int64_t columns = 1)
       : x_(x),
         shape_{x.size(0), rows, columns},
@@ -87,17 +87,17 @@ class Recorded {
   Record<T> x, v, C, F, J, residual, history, stress;
   Record<T> mapped;  // F after the return maps
 
-  // In `memory`, from an earlier `take`, or in its own.
+  // In `memory`, filled by an earlier `run`, or in new memory.
   Recorded(const SubstepsInputs& in, const OptionalTensor& memory, backend::Stream stream);
 
-  // Takes all steps; false where the pool had no room, and must not grow.
-  bool take();
+  // Computes all steps; false if the pool had no room and must not grow.
+  bool run();
 
-  // Everything as it was after the grid update of a step, the last one or the one before the last that was asked for.
-  // False as `take`.
+  // Restores the state after the grid update of step i, which is the last step, or precedes the step of the last call.
+  // False as for `run`.
   bool return_to(int64_t i);
 
-  // All of it in one piece; undefined where a pool has grown out of it.
+  // The whole record in one tensor; undefined if a pool has outgrown it.
   Tensor memory() const { return steps.activation.max_blocks == in_.max_blocks ? memory_ : Tensor(); }
 
   // Particles before a step, and the status after its activation.
@@ -113,7 +113,7 @@ class Recorded {
                                     in_.x.device(), ScalarType::Int);
   }
 
-  // Of scenes with clocks of their own, after all steps.
+  // Times of scenes with separate clocks, after all steps.
   Tensor scene_time_after() const {
     Tensor after = empty(in_.x, {in_.scenes}, ScalarType::Double);
     torch::stable::copy_(after, torch::stable::select(scene_times_, 0, in_.n - 1));
@@ -130,7 +130,7 @@ class Recorded {
 
   void lay_out(Arena& arena);
   Grid grid_in(Arena& arena, const Tensor& nodes) const;
-  // That of a step, made where it is asked for: of many steps at once the device would wait for it.
+  // Blocks and nodes of a step, made on demand: making those of many steps at once would keep the device waiting.
   Grid grid(int64_t i) const {
     Arena arena = grids_;
     arena.skip(i * grid_size_);
@@ -150,7 +150,7 @@ class Recorded {
     steps.p2g.stress = constant(stress[i]);
   }
 
-  // Of obstacles. On CUDA the statuses count the steps.
+  // Sets the time of obstacles. On CUDA the statuses count the steps.
   void set_time(int64_t i) {
     if (MPM_BACKEND == MPM_BACKEND_IS_cpu) {
       steps.contact.time = time_[i];
@@ -161,7 +161,7 @@ class Recorded {
 
   bool activate(int64_t i) { return steps.activate(i == 0 && !goes_on_ ? nullptr : status(i - 1), status(i), stream_); }
 
-  // What the laws of a mixture write for their particles alone.
+  // Copies the fields that a law of a mixture writes only for its own particles.
   void keep_others(int64_t i) {
     if (steps.plastic) {
       Tensor to = mapped.matrix(i);
@@ -192,9 +192,9 @@ class Recorded {
   Particles<const T> first_;
   std::vector<double> time_;
   const ObstacleRow<T, D>* first_row_;
-  bool goes_on_;  // from a status before
+  bool goes_on_;  // from a previous status
   bool keeps_grids_ = false, taken_ = false;
-  Arena grids_;  // from the first one on
+  Arena grids_;  // begins at the first step
   int64_t grid_size_ = 0;
   Tensor nodes_;  // of all grids
   int* status_ = nullptr;
@@ -211,14 +211,14 @@ Recorded<T, D>::Recorded(const SubstepsInputs& in, const OptionalTensor& memory,
   while (int64_t(time_.size()) < in.n) time_.push_back(time_.back() + in.dt);
   first_history_ = packed_history(in.x, in.history, steps.columns);
   first_ = given_particles<T, D>(in, first_history_);
-  steps.forget_stress();  // each step has its own
+  steps.forget_stress();  // each step has its own stress
   steps.fuse(true);
   steps.activation.workspace_size = backend::activate_workspace(steps.activation, stream);
   Arena one, counted;
   grid_in(one, {});
   grid_size_ = one.size();
   one.template tensor<T>(in.x, Pool<T, D>::nodes_shape(steps.activation), in.x.scalar_type());
-  // At most half of what the particles take; torch_mpm/rollouts/budget.py counts on it.
+  // At most half of the memory of the particles; torch_mpm/rollouts/budget.py relies on it.
   keeps_grids_ = 2 * one.size() <= in.x.size(0) * (2 * D + 4 * D * D) * int64_t(sizeof(T));
   lay_out(counted);
   memory_ = has(memory) ? *memory : empty(in.x, {counted.size()}, ScalarType::Byte);
@@ -249,7 +249,7 @@ template <class T, int D>
 void Recorded<T, D>::lay_out(Arena& arena) {
   const Tensor& given = in_.x;
   const int64_t n = in_.n;
-  const bool mls = steps.p2g.form == StressForm::mls;  // F and J move with the affine field, which is recorded then
+  const bool mls = steps.p2g.form == StressForm::mls;  // F and J move with the affine field, which is then recorded
   x = Record<T>(arena, given, n, D);
   v = Record<T>(arena, given, n, D);
   if (mls || in_.wants_C) C = Record<T>(arena, given, n, D, D);
@@ -278,7 +278,7 @@ typename Recorded<T, D>::Grid Recorded<T, D>::grid_in(Arena& arena, const Tensor
 }
 
 template <class T, int D>
-bool Recorded<T, D>::take() {
+bool Recorded<T, D>::run() {
   if (keeps_grids_) backend::clear(nodes_, stream_);
   for (int64_t i = 0; i < in_.n; i++) {
     steps.nodes_are_clear = keeps_grids_;
@@ -289,7 +289,7 @@ bool Recorded<T, D>::take() {
     read(i);
     set_time(i);
     if (!activate(i)) return false;
-    if (!memory().defined()) keeps_grids_ = steps.nodes_are_clear = false;  // the one pool that has grown serves all
+    if (!memory().defined()) keeps_grids_ = steps.nodes_are_clear = false;  // all steps share the grown pool
     steps.write({x[i], v[i], C[i], F[i], J[i], residual[i], history[i]});
     if (has(in_.material)) keep_others(i);
     steps.move(stream_);
@@ -306,7 +306,7 @@ bool Recorded<T, D>::return_to(int64_t i) {
   if (MPM_BACKEND != MPM_BACKEND_IS_cpu) steps.contact.activations = status(i) + kActivations;
   if (keeps_grids_ || (i + 1 == in_.n && taken_)) return true;
   if (!activate(i)) return false;
-  steps.fused = steps.nodes_are_clear = false;  // the stress is there
+  steps.fused = steps.nodes_are_clear = false;  // the stress is recorded
   steps.move_grid(stream_);
   return true;
 }

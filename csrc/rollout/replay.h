@@ -13,15 +13,15 @@
 #include "cpu/parallel.h"
 #endif
 
-// What a call of many substeps saves: threads that come and go with each loop, and launches of kernels by the host.
+// Overheads that a call of many substeps avoids: starts of threads for each loop, and launches of kernels by the host.
 namespace mpm {
 
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
 
-// Runs `work()`, of many parallel loops over `particles`, with one team of threads, or with none.
+// Runs `work()`, which has many parallel loops over `particles`, with one team of threads, or without one.
 template <class Work>
 void with_team(int64_t particles, const Work& work) {
-  constexpr int64_t few = 1 << 13;  // of which a thread is faster alone than it calls the others
+  constexpr int64_t few = 1 << 13;  // number of particles below which one thread is faster than a team
   const cpu::Alone alone(particles < few);
   if (particles < few) return work();
   cpu::with_team([](void* w) { (*static_cast<const Work*>(w))(); }, const_cast<Work*>(&work));
@@ -34,20 +34,20 @@ void with_team(int64_t, const Work& work) {
   work();
 }
 
-// Makes the graphs of a thread, and keeps the latest one that is replayed. The next one is mostly the same but for its
-// pointers, and to change these takes a third of the time of a new one. Its stream is its own, since torch's default
-// stream records nothing.
+// Records the graphs of a thread, and stores the latest one. The next graph mostly differs in its pointers only, and an
+// update of these takes a third of the time of a new graph. It has a separate stream, since torch's default stream
+// cannot be captured.
 class Recorder {
  public:
   static Recorder& of_this_thread() {
-    static thread_local Recorder* const recorder = new Recorder;  // has no end: CUDA may be gone by then
+    static thread_local Recorder* const recorder = new Recorder;  // never destroyed: CUDA may be unloaded before
     return *recorder;
   }
 
   template <class Work>
   void record(const Work& work) {
     use_device();
-    // Relaxed: what other threads do meanwhile is not in the recording, and may not fail for it.
+    // Relaxed: concurrent work of other threads is not captured, and must not fail.
     check(cudaStreamBeginCapture(stream_, cudaStreamCaptureModeRelaxed));
     cudaGraph_t graph = nullptr;
     try {
@@ -64,7 +64,7 @@ class Recorder {
     }
     cudaGraphExecUpdateResultInfo info;
     if (executable_ && cudaGraphExecUpdate(executable_, graph, &info) != cudaSuccess) {
-      cudaGetLastError();  // which is no error: another graph takes its place
+      cudaGetLastError();  // not an error: a new graph replaces it
       forget();
     }
     const cudaError_t made = executable_ ? cudaSuccess : cudaGraphInstantiate(&executable_, graph, 0);
@@ -138,16 +138,17 @@ class Recorder {
     return shape;
   }
 
-  void forget() {  // what still runs is freed when it has ended
+  void forget() {  // a running graph is freed when it has ended
     if (executable_) cudaGraphExecDestroy(executable_);
     executable_ = nullptr;
   }
-  // To destroy a graph with a loop, even one that has ended, takes until the device has nothing to do, so those of all
-  // threads are destroyed once there are some.
+  // Destroying a graph with a loop waits until the device is idle, even if the graph has ended. Therefore the graphs of
+  // all threads are collected and destroyed together.
   static void forget_later(cudaGraphExec_t loop) {
     constexpr size_t most = 32;
     static std::mutex mutex;
-    static std::vector<cudaGraphExec_t>* const kept = new std::vector<cudaGraphExec_t>;  // as the recorder, has no end
+    static std::vector<cudaGraphExec_t>* const kept =
+        new std::vector<cudaGraphExec_t>;  // never destroyed, like the recorder
     std::vector<cudaGraphExec_t> old;
     {
       const std::lock_guard<std::mutex> lock(mutex);
@@ -163,15 +164,15 @@ class Recorder {
   std::vector<int> shape_;
 };
 
-constexpr int64_t kLeastReplays = 6;  // which a recording has to save its own time
+constexpr int64_t kLeastReplays = 6;  // least number for which a recording pays
 
 inline bool is_recorded(cudaStream_t stream) {
   cudaStreamCaptureStatus status = cudaStreamCaptureStatusActive;
   return cudaStreamIsCapturing(stream, &status) != cudaSuccess || status != cudaStreamCaptureStatusNone;
 }
 
-// How often `work(stream)` was replayed: `times`, or never where a recording would not pay or the stream is recorded
-// itself. It must be kernels, copies and memory that is set, alone. `launched()` is called after each replay.
+// Number of replays of `work(stream)`: `times`, or zero if a recording would not pay or the stream itself is captured.
+// The work must consist of kernels, copies and memsets only. `launched()` is called after each replay.
 template <class Work, class Launched>
 int64_t replay(int64_t times, cudaStream_t stream, const Work& work, const Launched& launched) {
   if (times < kLeastReplays || is_recorded(stream)) return 0;
@@ -185,9 +186,9 @@ int64_t replay(int64_t times, cudaStream_t stream, const Work& work, const Launc
 }
 
 #if CUDART_VERSION >= 13000
-// Has the device do `work(stream, condition)` once, and again until a kernel of it sets the condition to zero. It must
-// be kernels, copies and memory that is set, alone. With TORCH_MPM_HOST_LOOPS the condition is null and the host asks
-// `goes_on()` each time: compute-sanitizer takes what kernels read in loops of graphs for memory that is not allocated.
+// Runs `work(stream, condition)` once, and repeats it on the device until one of its kernels sets the condition to
+// zero. The work must consist of kernels, copies and memsets only. With TORCH_MPM_HOST_LOOPS the condition is null and
+// the host calls `goes_on()` after each run: compute-sanitizer reports reads in loops of graphs as invalid.
 template <class Work, class GoesOn>
 void repeat(cudaStream_t stream, const Work& work, const GoesOn& goes_on) {
   static const bool by_host = std::getenv("TORCH_MPM_HOST_LOOPS");
@@ -196,7 +197,7 @@ void repeat(cudaStream_t stream, const Work& work, const GoesOn& goes_on) {
   while (goes_on());
 }
 
-// `count` values of the device as they are once the stream is done.
+// `count` values of the device after the work of the stream.
 template <class T>
 std::vector<T> on_host(const T* values, int64_t count, cudaStream_t stream) {
   std::vector<T> copy(count);

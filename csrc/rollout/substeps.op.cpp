@@ -23,13 +23,14 @@ Tensor copy_of(const Tensor& t) {
 
 using Results = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
-// Everything that the adjoint reads is kept. Nothing where there is no room, and it has to be told when that was.
+// Computes the steps with a record of the inputs of the adjoint. Empty if the pool has no room: then the steps are
+// repeated without a record, and the status reports the activation.
 template <class T, int D>
-std::optional<Results> take_recorded(const SubstepsInputs& in, backend::Stream stream) {
+std::optional<Results> run_recorded(const SubstepsInputs& in, backend::Stream stream) {
   Recorded<T, D> r(in, {}, stream);
   schedule_of_latest = schedule_of(in.schedule, r.steps.facts);
   bool room = false;
-  with_team(in.x.size(0) * in.n, [&] { room = r.take(); });
+  with_team(in.x.size(0) * in.n, [&] { room = r.run(); });
   if (!room) return {};
   const int64_t last = in.n - 1;
   const Tensor status = copy_of(r.status_tensor(last));
@@ -56,7 +57,7 @@ std::optional<Results> take_recorded(const SubstepsInputs& in, backend::Stream s
 
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
 
-// As they were given, where the first activation finds no room.
+// The given particles, if the first activation finds no room.
 template <class T, int D>
 Results no_step(const SubstepsInputs& in, const Tensor& history, const Tensor& status, const Tensor& impulse,
                 const Tensor& time) {
@@ -80,29 +81,29 @@ Results no_step(const SubstepsInputs& in, const Tensor& history, const Tensor& s
 }
 
 template <class T, int D>
-Results take_steps(const SubstepsInputs& in, backend::Stream stream) {
+Results run_steps(const SubstepsInputs& in, backend::Stream stream) {
   Substeps<T, D> s(in);
-  s.facts.records = false;  // or they would be recorded
+  s.facts.records = false;  // this call does not record
   const bool sorts = (schedule_of_latest = schedule_of(in.schedule, s.facts)) == kSortedCpu;
   const Tensor history = packed_history(in.x, in.history, s.columns);
   Tensor status[] = {empty_int(in.x, {1 + in.scenes, kStatusSize}), empty_int(in.x, {1 + in.scenes, kStatusSize})};
   Tensor impulse, time;
   if (has(in.impulse)) s.add_impulses_to(impulse = copy_of(*in.impulse));
   if (has(in.scene_time)) s.count_scene_times(time = copy_of(*in.scene_time));
-  if (sorts && OwnParticles<T, D>::may_last(in)) s.make_margin();
+  if (sorts && SortedCpu<T, D>::may_last(in)) s.make_margin();
   s.make_pool(stream);
-  OwnParticles<T, D> particles(s, history, sorts, stream);
+  SortedCpu<T, D> particles(s, history, sorts, stream);
   const int* before = s.previous_status;
-  int64_t step = 0, last = 0;  // the last status
+  int64_t step = 0, last = 0;  // index of the last status
   with_team(in.x.size(0) * in.n, [&] {
     while (step < in.n) {
       int* const now = static_cast<int*>(status[last = step % 2].data_ptr());
-      if (!particles.step(before, now, in.n - 1 - step)) break;  // and the status tells
+      if (!particles.step(before, now, in.n - 1 - step)) break;  // reported in the status
       before = now;
       step++;
       after_substeps(in.x.size(0), 1, stream);
     }
-    particles.give_back();
+    particles.restore_order();
   });
   if (step == 0) return no_step<T, D>(in, history, status[0], impulse, time);
   return {particles.x.tensor(),
@@ -126,12 +127,12 @@ Results run(const SubstepsInputs& in) {
   const DeviceScope device(x);
   if (in.records && !has(in.impulse) && x.size(0) > 0) {
     std::optional<Results> recorded;
-    dispatch(x, [&]<class T, int D>() { recorded = take_recorded<T, D>(in, device.stream()); });
+    dispatch(x, [&]<class T, int D>() { recorded = run_recorded<T, D>(in, device.stream()); });
     if (recorded) return *recorded;
   }
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
   Results results;
-  dispatch(x, [&]<class T, int D>() { results = take_steps<T, D>(in, device.stream()); });
+  dispatch(x, [&]<class T, int D>() { results = run_steps<T, D>(in, device.stream()); });
   return results;
 #else
   const int64_t P = x.size(0), D_ = x.size(1), n = in.n;
@@ -139,10 +140,10 @@ Results run(const SubstepsInputs& in) {
   Tensor F_[] = {result(x, has(in.F), {P, D_, D_}), Tensor()};
   Tensor J_[] = {result(x, has(in.J), {P}), Tensor()};
   Tensor v_ = empty_particles(x, {P, D_}), C_ = result(x, in.wants_C, {P, D_, D_}), history_;
-  Tensor residual_ = result(x, has(in.residual), {P, D_});  // which G2P alone reads
+  Tensor residual_ = result(x, has(in.residual), {P, D_});  // read by G2P only
   Tensor status[] = {empty_int(x, {1 + in.scenes, kStatusSize}), empty_int(x, {1 + in.scenes, kStatusSize})};
   Tensor impulse_, time_;
-  int last = 0;  // of the two buffers, that of the last step
+  int last = 0;  // index of the buffer of the last step
   const auto start_in_results = [&] {
     torch::stable::copy_(x_[0], x);
     torch::stable::copy_(v_, in.v);
@@ -181,15 +182,15 @@ Results run(const SubstepsInputs& in) {
       const Particles<T> in_place = buffers(0);
       s.read(constant(in_place), in_place.F);
       s.write(in_place);
-      // The last one has an activation of its own, so that the status tells how many blocks there are by then.
+      // The last substep has its own activation, whose status counts the blocks at the end.
       int* const activated = static_cast<int*>(status[1].data_ptr());
       int* const now = static_cast<int*>(status[0].data_ptr());
       double last_time = in.time;
       for (int64_t k = 1; k < n; k++) last_time += in.dt;
       s.activate(before, activated, stream);
-      take_scenes(s, n - 1, 0, in.time, activated, now, stream);
+      run_scenes(s, n - 1, 0, in.time, activated, now, stream);
       s.activate(now, activated, stream);
-      take_scenes(s, 1, n - 1, last_time, activated, now, stream);
+      run_scenes(s, 1, n - 1, last_time, activated, now, stream);
       after_substeps(P, n, stream);
       return;
     }
@@ -197,18 +198,18 @@ Results run(const SubstepsInputs& in) {
     s.fuse(false);
     s.make_pool(stream);
     s.count_time(before, stream);
-    if (schedule == kFusedG2P2G) return Merged<T, D>(s, buffers(0), status, stream).take_all(from, before);
-    const bool late = s.moves_late();  // then F and J stay where they are
+    if (schedule == kFusedG2P2G) return FusedG2P2G<T, D>(s, buffers(0), status, stream).run(from, before);
+    const bool late = s.moves_late();  // then F and J are updated in place
     x_[1] = result(x, n > 1, {P, D});
     F_[1] = late ? F_[0] : result(x, has(in.F) && (n > 1 || s.plastic), {P, D, D});
     J_[1] = late ? J_[0] : result(x, has(in.J) && n > 1, {P});
-    if (s.plastic && has(in.F) && !late) {  // which laws change where it stands
+    if (s.plastic && has(in.F) && !late) {  // laws change it in place
       torch::stable::copy_(F_[1], *in.F);
       from.F = field<const T>(F_[1]);
     }
     bool first = true;
-    // A substep that reads and writes these buffers in turn, into the first or the second.
-    const auto take = [&](int into, bool last, backend::Stream on) {
+    // One substep from one of the two buffers into the other.
+    const auto substep = [&](int into, bool last, backend::Stream on) {
       int* const now = static_cast<int*>(status[into].data_ptr());
       s.take_turn(into, last);
       s.read(from, field<T>(F_[1 - into]));
@@ -219,36 +220,35 @@ Results run(const SubstepsInputs& in) {
       s.move(on);
       before = now;
       first = false;
-      // From here on the call reads what it has written.
+      // The next substep reads these results.
       from = constant(to);
     };
     int64_t step = 0;
 #if CUDART_VERSION >= 13000
     if (schedule == kPersistent) {
       s.activation.most_of_item = persistent_item<D>(in.x.size(0));
-      take(0, false, stream);
+      substep(0, false, stream);
       const Particles<T> in_place = buffers(0);
       s.read(from, in_place.F);
       s.write(in_place);
       s.move_late(in_place, true, false);
       step = 1;
-      if (take_persistent(s, static_cast<int*>(status[1].data_ptr()), static_cast<int*>(status[0].data_ptr()),
-                          stream)) {
-        take(last = 1, true, stream);
+      if (run_persistent(s, static_cast<int*>(status[1].data_ptr()), static_cast<int*>(status[0].data_ptr()), stream)) {
+        substep(last = 1, true, stream);
         after_substeps(P, n, stream);
         return;
       }
-      if (in.schedule == kChoose) schedule_of_latest = kPerStep;  // of the rest
+      if (in.schedule == kChoose) schedule_of_latest = kPerStep;  // for the remaining substeps
       s.facts.graph_loops = !loops_are_refused;
       schedule_of(in.schedule, s.facts);  // an error if it was requested
     }
 #endif
     while (step < n) {
       last = int(step % 2);
-      take(last, step + 1 == n, stream);
+      substep(last, step + 1 == n, stream);
       after_substeps(P, 1, stream);
       if (++step == 2) {
-        const auto two = [&](backend::Stream on) { take(0, false, on), take(1, false, on); };
+        const auto two = [&](backend::Stream on) { substep(0, false, on), substep(1, false, on); };
         step += 2 * replay((n - step - 1) / 2, stream, two, [&] { after_substeps(P, 2, stream); });
       }
     }
@@ -280,6 +280,6 @@ MPM_LIBRARY_IMPL(m) {
 }
 
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda
-// Whether the device is not known to refuse CUDA graphs with loops.
+// Whether no device has refused CUDA graphs with loops.
 extern "C" __attribute__((visibility("default"))) int torch_mpm_graph_loops() { return !mpm::loops_are_refused; }
 #endif

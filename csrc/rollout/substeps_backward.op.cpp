@@ -1,24 +1,24 @@
 #include "rollout/recorded.h"
 #include "rollout/replay.h"
 
-// The adjoint of n steps in one call. The steps are taken once more, and what each of them reads is recorded, or it has
-// been when they were taken first; then the adjoint kernels go through them from the last to the first. In
-// deterministic grids of CUDA the second time is the first bit by bit. Elsewhere it differs by rounding, and the
-// gradient is that of the second time.
+// The adjoint of n steps in one call. The steps are recomputed with a record of the inputs of each, unless the forward
+// pass has made the record; then the adjoint kernels process them from the last to the first. On deterministic CUDA
+// grids the recomputed steps are bitwise those of the forward pass. Elsewhere they differ by rounding, and the gradient
+// is that of the recomputed steps.
 namespace mpm {
 namespace {
 
-// Per particle; undefined where there is none.
+// Adjoints per particle; absent ones are undefined.
 struct Adjoints {
   Tensor x, v, C, F, J, history, mass, volume;
   Tensor parameters;  // [P, n], of all laws
-  Tensor dt;          // [P], by the product dt * scene_dt, but for gravity
+  Tensor dt;          // [P], with respect to dt * scene_dt, without gravity
 };
 
 // Bits of `needs`, in the order of the returned tensors after those of the state.
 enum Need : int64_t { kMass = 1, kVolume = 2, kParameters_ = 4, kGravity = 8, kObstacles = 16, kTimeStep = 32 };
 
-// Sums over the grid, undefined where they are not wanted: of gravity by blocks of the domain, and of the table of
+// Adjoints summed over the grid, undefined if not wanted: of gravity, by blocks of the domain, and of the table of
 // obstacles.
 struct GridSums {
   Tensor gravity, obstacles;
@@ -27,16 +27,16 @@ struct GridSums {
 template <class T, int D>
 class SubstepsBackward {
  public:
-  // `grad_impulse` is the adjoint of the impulses at the end, or nothing; `record` is of the steps, or nothing.
+  // `grad_impulse` is the adjoint of the final impulses, or nothing; `record` is that of the steps, or nothing.
   SubstepsBackward(const SubstepsInputs& in, const OptionalTensor& grad_impulse, const OptionalTensor& record,
                    int64_t needs, backend::Stream stream);
 
   int64_t columns() const { return s_.columns; }  // of the history of all laws
   int64_t blocks() const { return s_.update.block_count; }
 
-  // The adjoints of the state at the end become those of the state at the beginning, and the others are added up.
+  // The adjoints of the final state become those of the initial state; the others are accumulated.
   void run(Adjoints& adjoints, const GridSums& sums) {
-    if (!recorded_) check_room(r_.take());
+    if (!recorded_) check_room(r_.run());
     const int64_t slots = s_.activation.slots(), rows = slots * kBlockNodes<D>;
     motions_ = std::clamp<int64_t>(kCleared / std::max<int64_t>(rows * (1 + D) * int64_t(sizeof(T)), 1), 1, in_.n);
     motion_ = empty(in_.x, {motions_, rows, 1 + D});
@@ -48,10 +48,10 @@ class SubstepsBackward {
     for (int64_t i = in_.n - 1; i >= 0; i--) {
       check_room(r_.return_to(i));
       if (s_.flips()) keep_adjoint(adjoints);
-      leave_advance(i, adjoints);
-      leave_grid(i, adjoints, sums);
-      if (s_.flips()) leave_kept(adjoints);
-      leave_laws(adjoints);
+      backward_advance(i, adjoints);
+      backward_grid(i, adjoints, sums);
+      if (s_.flips()) backward_kept(adjoints);
+      backward_laws(adjoints);
       if (adjoints.dt.defined()) add_terms({{adjoints.dt, motion_dt_}, {adjoints.dt, stress_dt_}});
       after_substeps(in_.x.size(0), 1, stream_);
     }
@@ -66,16 +66,16 @@ class SubstepsBackward {
   }
 
   void make_terms(int64_t needs);
-  void leave_advance(int64_t i, Adjoints& adjoints);
+  void backward_advance(int64_t i, Adjoints& adjoints);
   AdvanceBackwardArguments<T, D> advance(int64_t i, Adjoints& adjoints) const;
   PositionGradientArguments<T, D> motion(const Adjoints& adjoints) const;
-  void leave_grid(int64_t i, Adjoints& adjoints, const GridSums& sums);
-  void leave_obstacles(int64_t i, const T* nodes, const GridSums& sums);
+  void backward_grid(int64_t i, Adjoints& adjoints, const GridSums& sums);
+  void backward_obstacles(int64_t i, const T* nodes, const GridSums& sums);
   void keep_adjoint(const Adjoints& adjoints);
-  void leave_kept(Adjoints& adjoints);
-  void leave_laws(Adjoints& adjoints);
+  void backward_kept(Adjoints& adjoints);
+  void backward_laws(Adjoints& adjoints);
 
-  // To each of these sums a term of the same strides, where there is one.
+  // Adds to each sum its term of the same strides, if there is one.
   void add_terms(std::initializer_list<std::pair<Tensor, Tensor>> sums) {
     AccumulateArguments<T, D> a;
     for (const auto& [sum, term] : sums) {
@@ -87,7 +87,7 @@ class SubstepsBackward {
     backend::accumulate(a, stream_);
   }
 
-  // The adjoint of the impulses on some boundaries.
+  // The adjoint of the impulses on `count` boundaries from `first` on.
   ImpulseArguments<D> impulses(int64_t first, int64_t count) const {
     return impulse_gradient<D>(in_.lattice, *grad_impulse_, first, count, s_.impulse_shape(), in_.x);
   }
@@ -101,15 +101,15 @@ class SubstepsBackward {
   bool mls_;  // F and J move with the affine field
   Tensor stress_, F_term_, parameters_term_;
   Tensor motion_dt_, stress_dt_;  // of the end of a step, and of P2G [P]
-  Tensor gradient_;  // the velocity gradient that moves F and J where that is not the affine field, or its adjoint
-  static constexpr int64_t kCleared = 1 << 26;  // bytes at once: a pass of memory costs a launch, too
+  Tensor gradient_;  // velocity gradient that moves F and J, if that is not the affine field; or its adjoint
+  static constexpr int64_t kCleared = 1 << 26;  // bytes cleared at once, to save launches
   int64_t motions_ = 1;
-  // Adjoints on the nodes [N, 1 + D], of their motion in some steps, before contact and before the grid update; and of
-  // the velocity change by gravity, by slots.
+  // Adjoints on the nodes [N, 1 + D]: of their motion in several steps, before contact, and before the grid update; and
+  // of the velocity change by gravity, by slots.
   Tensor motion_, contact_, update_, change_;
   Tensor row_grad_;  // of the table of obstacles, by slots
-  // With FLIP: the nodes before the forces, the adjoints of their velocities, and these [3, N, 1 + D]; and of particles
-  // the adjoint of what is subtracted from G2P, and what the first of these nodes give to those of v and C.
+  // With FLIP, [3, N, 1 + D]: the node sums before the forces, the adjoints of their velocities, and the velocities;
+  // per particle: the adjoint of the velocity that FLIP subtracts from G2P, and the terms of v and C from these nodes.
   Tensor before_, kept_, v_term_, C_term_;
 };
 
@@ -126,7 +126,7 @@ SubstepsBackward<T, D>::SubstepsBackward(const SubstepsInputs& in, const Optiona
   make_terms(needs);
 }
 
-// Laws that change nothing add to the adjoints, and others have these terms.
+// Laws without a return map or history add to the adjoints; others write these terms.
 template <class T, int D>
 void SubstepsBackward<T, D>::make_terms(int64_t needs) {
   const Tensor& x = in_.x;
@@ -152,10 +152,10 @@ void SubstepsBackward<T, D>::make_terms(int64_t needs) {
     if (term->defined()) torch::stable::zero_(*term);
 }
 
-// From x, F and J at the end of a step to F and J after the laws, to the motion of the particles, and through G2P to
-// that of the nodes.
+// Adjoint of the end of a step and of G2P: from x, F and J after the step to F and J after the laws, the motion of the
+// particles, and that of the nodes.
 template <class T, int D>
-void SubstepsBackward<T, D>::leave_advance(int64_t i, Adjoints& adjoints) {
+void SubstepsBackward<T, D>::backward_advance(int64_t i, Adjoints& adjoints) {
   if (!mls_) {
     GatherArguments<T, D> g = s_.advance.gather;
     g.value = g.moment = {};
@@ -204,7 +204,7 @@ AdvanceBackwardArguments<T, D> SubstepsBackward<T, D>::advance(int64_t i, Adjoin
   return a;
 }
 
-// What the adjoint of G2P adds to the nodes, with its position gradient.
+// Arguments of the adjoint of G2P, with its position gradient.
 template <class T, int D>
 PositionGradientArguments<T, D> SubstepsBackward<T, D>::motion(const Adjoints& adjoints) const {
   PositionGradientArguments<T, D> a;
@@ -220,9 +220,9 @@ PositionGradientArguments<T, D> SubstepsBackward<T, D>::motion(const Adjoints& a
   return a;
 }
 
-// From the adjoints of the nodes after contact to those before, and to that of the table.
+// Adjoint of contact: of the nodes before it, and of the table of obstacles.
 template <class T, int D>
-void SubstepsBackward<T, D>::leave_obstacles(int64_t i, const T* nodes, const GridSums& sums) {
+void SubstepsBackward<T, D>::backward_obstacles(int64_t i, const T* nodes, const GridSums& sums) {
   ContactArguments<T, D> contact = s_.contact;
   contact.grad = nodes + 1;
   contact.grad_stride = 1 + D;
@@ -243,16 +243,16 @@ void SubstepsBackward<T, D>::leave_obstacles(int64_t i, const T* nodes, const Gr
                      stream_);
 }
 
-// Through obstacles, grid update and P2G.
+// Adjoint of contact, grid update and P2G.
 template <class T, int D>
-void SubstepsBackward<T, D>::leave_grid(int64_t i, Adjoints& adjoints, const GridSums& sums) {
+void SubstepsBackward<T, D>::backward_grid(int64_t i, Adjoints& adjoints, const GridSums& sums) {
   const Tensor& gravity = sums.gravity;
   T* const nodes = motion_of(i);
   GridUpdateBackwardArguments<T, D> update;
   update.forward = s_.update;
   update.grad_updated = reinterpret_cast<const NodeRow<T, D>*>(nodes);
   if (s_.obstacles) {
-    leave_obstacles(i, nodes, sums);
+    backward_obstacles(i, nodes, sums);
     update.grad_updated = static_cast<const NodeRow<T, D>*>(contact_.data_ptr());
   }
   update.grad_nodes = static_cast<NodeRow<T, D>*>(update_.data_ptr());
@@ -281,20 +281,20 @@ void SubstepsBackward<T, D>::leave_grid(int64_t i, Adjoints& adjoints, const Gri
   p2g.dt = field<T>(stress_dt_);
   p2g.adds = true;
   backend::p2g_backward(in_.lattice.order(), p2g, stream_);
-  if (!s_.p2g.affine.pointer) torch::stable::zero_(adjoints.C);  // which the position gradient has read
+  if (!s_.p2g.affine.pointer) torch::stable::zero_(adjoints.C);  // already read by the position gradient
 }
 
-// Of the velocities of the nodes before the forces, of which FLIP's share is subtracted from G2P.
+// Adjoint of the node velocities before the forces; FLIP subtracts its share of them from G2P.
 template <class T, int D>
 void SubstepsBackward<T, D>::keep_adjoint(const Adjoints& adjoints) {
   const Field<const T> v = field<const T>(adjoints.v);
   backend::add_scaled(AddScaledArguments<T, D>{in_.x.size(0), field<T>(kept_), {}, v, -in_.flip}, stream_);
 }
 
-// Through FLIP's share: what is kept of the velocity of a particle, and of those of the nodes before the forces. The
-// rest of its change is in the adjoint of G2P.
+// Adjoint of FLIP's share, through the velocities of the particle and of the nodes before the forces. The remaining
+// terms are in the adjoint of G2P.
 template <class T, int D>
-void SubstepsBackward<T, D>::leave_kept(Adjoints& adjoints) {
+void SubstepsBackward<T, D>::backward_kept(Adjoints& adjoints) {
   const int64_t order = in_.lattice.order(), size = before_.stride(0);
   Tensor sums = torch::stable::narrow(before_, 0, 0, 2);
   backend::clear(sums, stream_);
@@ -329,10 +329,10 @@ void SubstepsBackward<T, D>::leave_kept(Adjoints& adjoints) {
   backend::add_scaled(AddScaledArguments<T, D>{in_.x.size(0), v, constant(v), motion.value, -1}, stream_);
 }
 
-// From F after the laws, their stress and history to F and history before, the last law first. A law changes the
-// adjoints of what it maps where they stand, and adds to those of what it only reads.
+// Adjoint of the laws, the last one first: from F after the laws, stress and history to F and history before. A law
+// updates the adjoints of the quantities that it maps in place, and adds to those that it only reads.
 template <class T, int D>
-void SubstepsBackward<T, D>::leave_laws(Adjoints& adjoints) {
+void SubstepsBackward<T, D>::backward_laws(Adjoints& adjoints) {
   int64_t parameter = int64_t(in_.parameters.size());
   for (size_t k = s_.calls.size(); k-- > 0;) {
     const LawCall& call = s_.calls[k];
@@ -359,7 +359,7 @@ void SubstepsBackward<T, D>::leave_laws(Adjoints& adjoints) {
     add_terms({{adjoints.F, F_term_}, {adjoints.parameters, parameters_term_}});
 }
 
-// Zero where there is no gradient.
+// Sets an adjoint to the given gradient, or to zero.
 void set(Tensor& adjoint, const OptionalTensor& grad, const char* name, const Tensor& x) {
   if (!adjoint.defined()) return;
   if (!has(grad)) {

@@ -31,20 +31,20 @@ struct AdvancedRows {
 
   // Prefetches the cache lines of a particle, where all strides are 1. GCC removes calls of functions that do only
   // this.
-  MPM_HD void expect(int p) const {
+  MPM_HD void prefetch(int p) const {
     if (x.row[0] != x_next.row[0]) {
-      expect<false>(x, p);
-      expect<false>(F, p);
+      prefetch<false>(x, p);
+      prefetch<false>(F, p);
     }
-    expect<true>(x_next, p);
-    expect<true>(F_next, p);
-    expect<true>(v, p);
-    expect<true>(affine, p);
+    prefetch<true>(x_next, p);
+    prefetch<true>(F_next, p);
+    prefetch<true>(v, p);
+    prefetch<true>(affine, p);
   }
 
  private:
   template <bool Writes, class E, int N>
-  MPM_HD static void expect(const FieldRows<E, N>& f, int p) {
+  MPM_HD static void prefetch(const FieldRows<E, N>& f, int p) {
     if (!f) return;
     MPM_UNROLL for (int k = 0; k < N; k++)
       __builtin_prefetch(f.row[k] + p, Writes, 2);

@@ -35,13 +35,13 @@ void g2p_advance_with(const G2PAdvanceArguments<T, D>& a) {
   gather_chunks<Order>(in.topology, in.nodes, 0, D, [&] {
     return [&, motion = Motion<Gradient, T, D>()](const BaseBlock<T, D>& base_block, const Chunk& chunk,
                                                   const Chunk& next, const Tile<Order, T, D>& tile) mutable {
-      int expected = 0;
+      int prefetched = 0;
       const auto visit = [&](const Group&, int i, const Lanes<T> f[D], const T* at) {
         Sums<Lanes<T>, D> s[D];
         gather_channels<Order, D, true, Gradient, T, D>(f, at, s);
         motion.put(i, s);
-        for (; direct && expected <= i && expected < next.count; expected += 64 / sizeof(T))
-          rows.expect(next.id[expected]);
+        for (; direct && prefetched <= i && prefetched < next.count; prefetched += 64 / sizeof(T))
+          rows.prefetch(next.id[prefetched]);
       };
       for_groups_of_cells(in.topology, in.x, base_block, chunk, tile, visit);
       advance(chunk, base_block.scene, motion);

@@ -670,8 +670,8 @@ __device__ void flush_tile(const Nodes& nodes, const int slots[1 << D], const T*
   }
 }
 
-// Adds the particles in shared memory to the nodes, and lets `strays` add those in no list; `when_added` is called when
-// none of them is needed any more. All threads have to wait before that memory is reused.
+// Adds the particles in shared memory to the nodes; `add_strays` adds those in no list. `when_added` is called when
+// their memory is no longer needed. All threads have to wait before that memory is reused.
 template <class S, class Nodes, class AddStrays, class WhenAdded>
 __device__ void add_particles(const Nodes& nodes, const SharedParticles<S>& shared, const int* slots, bool in_order,
                               const AddStrays& add_strays, const WhenAdded& when_added) {

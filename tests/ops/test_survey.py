@@ -10,7 +10,7 @@ from oracle import cfl as reference
 import torch_mpm as mpm
 from benchmarks.catalogue.laws import named
 from torch_mpm.ops import survey
-from torch_mpm.step.stability import figures_of
+from torch_mpm.step.stability import law_diagnostics
 
 F64 = torch.float64
 BOUND = 4 / 0.125**2
@@ -118,16 +118,16 @@ def test_steps_survey_their_state(device):
     given = particles(3, 2, device)
     state = given["state"].replace(material=(torch.arange(300, device=device) % 2).int())
     step = mpm.Step(grid(3, 2), mpm.Mixture([mpm.NeoHookean(E=1e5, nu=0.3), mpm.WeaklyCompressible(1e4)]))
-    figures = step.survey(state)
+    figures = step.stability_report(state)
     assert torch.equal(1 / figures.rate, step.stable_dt(state, 1.0))
     alone = [mpm.Step(step.grid, law).stable_dt(state.select((state.material == k).nonzero()[:, 0]), 1.0)
              for k, law in enumerate(step.law.laws)]  # fmt: skip
     assert torch.all(step.stable_dt(state, 1.0) <= torch.stack(alone).amin(0) * (1 + 1e-12))
     prepared = step.prepare(state)
     prepared.F[5] = -torch.eye(3, dtype=F64, device=device)  # a particle of the fluid
-    assert step.survey(prepared).wrong.tolist() == [0, 0]
+    assert step.stability_report(prepared).wrong.tolist() == [0, 0]
     prepared.F[4] = -torch.eye(3, dtype=F64, device=device)
-    assert step.survey(prepared).wrong.tolist() == [1, 0]
+    assert step.stability_report(prepared).wrong.tolist() == [1, 0]
 
 
 def test_op_is_well_formed(device):
@@ -158,34 +158,34 @@ def deformed(law, dim, device, dtype, scenes=3):
 
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
 @pytest.mark.parametrize("name", LAWS)
-def test_figures_of_a_law(name, dim, dtype, device):
+def test_law_diagnostics_a_law(name, dim, dtype, device):
     """Values of one op equal those of the law's methods, also for flow, inversion and parameters that are functions."""
     law = LAWS[name]()
     state = deformed(law, dim, device, dtype)
     with torch.no_grad():
-        stress, stiffness, energy = figures_of(law, state, True)
+        stress, stiffness, energy = law_diagnostics(law, state, True)
         assert torch.equal(stress, law.stress(state))
         assert torch.equal(stiffness, law.stiffness(state))
         assert torch.equal(energy, law.energy_density(state))
-        assert figures_of(law, state, False)[2] is None
+        assert law_diagnostics(law, state, False)[2] is None
     assert not bool(energy.isfinite().all())
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
-def test_figures_of_a_mixture(dim, dtype, device):
+def test_law_diagnostics_a_mixture(dim, dtype, device):
     laws = [LAWS[name]() for name in ("neo_hookean", "von_mises", "fluid", "snow")]
     law = mpm.Mixture(laws)
     state = deformed(law, dim, device, dtype)
     state = state.replace(material=(torch.arange(len(state), device=device) % 4).int())
     with torch.no_grad():
-        found = figures_of(law, state, True)
+        found = law_diagnostics(law, state, True)
         for k, part in enumerate(laws):
             of = state.material == k
             expected = part.stress(state), part.stiffness(state), part.energy_density(state)
             assert all(torch.equal(a[of], b[of]) for a, b in zip(found, expected, strict=True))
 
 
-def test_figures_of_what_a_law_adds(device):
+def test_law_diagnostics_what_a_law_adds(device):
     """The methods of a subclass are used where it overrides one."""
 
     class Harder(mpm.NeoHookean):
@@ -193,7 +193,7 @@ def test_figures_of_what_a_law_adds(device):
             return 2 * super().stiffness(state)
 
     state = deformed(LAWS["neo_hookean"](), 3, device, F64)
-    once, twice = (figures_of(law(E=2e4, nu=0.3), state, False)[1] for law in (mpm.NeoHookean, Harder))
+    once, twice = (law_diagnostics(law(E=2e4, nu=0.3), state, False)[1] for law in (mpm.NeoHookean, Harder))
     assert torch.equal(2 * once, twice)
 
 

@@ -1,8 +1,9 @@
-"""Control steps: how obstacles move whose pose or velocity was assigned between two calls of a step.
+"""Control steps: motion of obstacles whose pose or velocity was assigned between two calls of a step.
 
 A control step is one call of a step, of `rollout` or of `Environments.advance`, or the steps between two hooks. A state
-stores where steps have left their obstacles, so that a call is a function of its arguments. From there an obstacle
-moves to an assigned pose at constant rates, and reaches it at the end of the call. No function here synchronises.
+stores the poses of the obstacles after its steps, so that a call is a function of its arguments. An obstacle moves
+from the stored pose to the assigned one at constant rates, and reaches it at the end of the call. No function here
+synchronises.
 """
 
 from __future__ import annotations
@@ -31,16 +32,16 @@ if TYPE_CHECKING:
 
 ASSIGNED = ("position", "velocity", "rotation", "angular_velocity")
 SLACK = 0.01
-"""Of the way of a control step, by which a pose may differ from the one that a given velocity has led to."""
+"""Tolerance of a pose against the result of a given velocity, as a fraction of the motion in the control step."""
 
 
 class Left(NamedTuple):
-    """Where a state has left an obstacle.
+    """Pose and motion of an obstacle that are stored in a state.
 
     Attributes:
-        given: the attributes of the obstacle, in a form that shows whether they have changed.
-        placements: how often it was placed.
-        values: the attributes then, which later writes do not change; and `start` and `end`.
+        given: the attributes of the obstacle, in a form that detects changes.
+        placements: number of times that it was placed.
+        values: copies of the attributes, and `start` and `end`.
         moves: its motion from here on; None for that of its attributes.
         arrives: whether it may not have reached an assigned pose yet, in a scene that was paused.
         known: scenes with a stored pose, bool [B]; in others it is placed at its attributes. None for all.
@@ -55,11 +56,11 @@ class Left(NamedTuple):
 
     @property
     def motion(self) -> RigidMotion:
-        """How it moves from here on."""
+        """Motion from here on."""
         return _motion(self.values) if self.moves is None else self.moves
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Left:
-        """With other tensors."""
+        """The same with a function applied to all tensors."""
 
         def mapped(values: Sequence[Any]) -> tuple[Any, ...]:
             return tuple(function(v) if isinstance(v, Tensor) else v for v in values)
@@ -68,12 +69,12 @@ class Left(NamedTuple):
         return self._replace(values=mapped(self.values), moves=moves)
 
     def to(self, device: torch.device) -> Left:
-        """On another device."""
+        """Copy on another device."""
         left = self.map(lambda t: t.to(device))
         return left if self.known is None else left._replace(known=self.known.to(device))
 
     def copied(self, memo: dict[int, Any]) -> Left:
-        """Of a deep copy, in which an obstacle may have been copied before, too."""
+        """Copy for a deep copy, in which the obstacle may have been copied before."""
         given = tuple(
             copy.deepcopy(value, memo) if isinstance(value, Remembered) else memo.get(id(value), value)
             for value in self.given
@@ -81,12 +82,12 @@ class Left(NamedTuple):
         return self._replace(given=given)
 
     def without(self, scenes: Tensor) -> Left:
-        """Placed in some scenes, bool [B]."""
+        """The same, without stored poses in some scenes, bool [B]."""
         return self._replace(known=~scenes if self.known is None else self.known & ~scenes)
 
 
 Poses = dict[weakref.ref[Any], Left]
-"""By `Obstacle.key`."""
+"""Stored poses by `Obstacle.key`."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -94,9 +95,9 @@ class Course:
     """An obstacle in a control step.
 
     Attributes:
-        during: how it moves; None for its attributes.
-        after: where it is left.
-        contradicts: scenes in which its pose is not the one that its velocity led to, bool [] or [B]; None for none.
+        during: motion in the control step; None for that of its attributes.
+        after: pose and motion to store afterwards.
+        contradicts: scenes in which its pose differs from the result of its velocity, bool [] or [B]; None for none.
     """
 
     during: RigidMotion | None
@@ -105,7 +106,7 @@ class Course:
 
 
 class Span(NamedTuple):
-    """When a control step begins, how long it is, and each of its steps [s]: numbers, or tensors [] or [B]."""
+    """Start, duration and step length of a control step [s]: numbers, or tensors [] or [B]."""
 
     begin: float | Tensor
     seconds: float | Tensor
@@ -121,7 +122,7 @@ _THREAD = _Thread()
 
 @contextlib.contextmanager
 def steady() -> Iterator[None]:
-    """Where steps inside a control step assign no obstacle, and other tensors may stand in the place of its own."""
+    """Context in which steps inside a control step assign no obstacle; its tensors may be replaced by others."""
     before, _THREAD.steady = _THREAD.steady, True
     try:
         yield
@@ -138,14 +139,14 @@ def control_step(
 ) -> contextlib.AbstractContextManager[Leave]:
     """A context in which obstacles move as they do in n steps from a state.
 
-    A step inside another control step is one of its own for obstacles whose attributes were assigned meanwhile, as by
-    `on_particles`, and for no others.
+    A step inside another control step is a separate control step only for obstacles whose attributes were assigned in
+    the meantime, for example by `on_particles`.
 
     Args:
-        step: a `Step`, or a module that has some. The steps of another function are control steps each.
+        step: a `Step`, or a module that contains some. For another function each step is a control step.
         state: the state at the beginning.
         n, dt: as `rollout`.
-        seconds: how long the steps take, where that is not n dt.
+        seconds: duration of the steps [s], if that is not n dt.
 
     Raises:
         ValueError: on the CPU, where a velocity contradicts the change of a pose. On CUDA the status counts it.
@@ -162,7 +163,7 @@ def control_step(
 
 
 def _tell_apart(obstacles: Sequence[Obstacle]) -> None:
-    """Make copies beside those that they were copied from obstacles of their own."""
+    """Give copies of obstacles in the same step keys of their own."""
     known = set()
     for obstacle in obstacles if len(obstacles) > 1 else ():
         if obstacle.identity in known:
@@ -171,7 +172,7 @@ def _tell_apart(obstacles: Sequence[Obstacle]) -> None:
 
 
 def _nothing_new(obstacles: Sequence[Obstacle], poses: Poses) -> bool:
-    """Whether no obstacle follows a path or has another motion than in the steps before: all move as they are."""
+    """Whether no obstacle follows a path or has another motion than in the previous steps."""
     for obstacle in obstacles:
         course: Course | None = vars(obstacle)["course"]
         left = poses.get(obstacle.key) if course is None else course.after
@@ -186,7 +187,7 @@ def _nothing_new(obstacles: Sequence[Obstacle], poses: Poses) -> bool:
 
 @contextlib.contextmanager
 def _inside(step: Any, obstacles: Sequence[Obstacle], state: State, dt: float | Tensor) -> Iterator[Leave]:
-    """A step inside a control step. One that fails leaves obstacles as they were before it."""
+    """A step inside a control step. If it fails, obstacles are restored."""
     span = Span(state.time, dt, dt)
     before = [(o, o.course) for o in obstacles if o.course is not None]
     changed = {
@@ -211,8 +212,8 @@ def _inside(step: Any, obstacles: Sequence[Obstacle], state: State, dt: float | 
 
 
 def motions_now(step: Any, state: State) -> Callable[[], contextlib.AbstractContextManager[None]]:
-    """Makes a context in which obstacles whose attributes have been assigned meanwhile, inside a step, move as they do
-    now: that acts in the next control step."""
+    """Factory of a context in which obstacles keep their present motion if their attributes are assigned inside a step:
+    the assignment acts in the next control step."""
     fixed = _THREAD.steady or is_traced(state.x) or is_captured(state.x)
     now = [] if fixed else [(o, _left_at(o)) for o in obstacles_of(step) if o.motion is o]
 
@@ -245,8 +246,8 @@ def _control_step(step: Any, obstacles: Sequence[Obstacle], state: State, span: 
 
 
 def motions_of(step: Any, state: State) -> Callable[[], contextlib.AbstractContextManager[None]]:
-    """Makes a context in which obstacles move as they do now in steps from a state, for a backward pass that recomputes
-    these steps."""
+    """Factory of a context with the present motions of obstacles in steps from a state, for a backward pass that
+    recomputes these steps."""
     now = [(o, _Motions(o).stored(o, state.poses)) for o in obstacles_of(step)]
 
     @contextlib.contextmanager
@@ -264,15 +265,14 @@ def motions_of(step: Any, state: State) -> Callable[[], contextlib.AbstractConte
 
 
 class _Motions:
-    """The attributes of an obstacle and its control step, to go back to."""
+    """The attributes and the control step of an obstacle, for a later restoration."""
 
     def __init__(self, obstacle: Obstacle) -> None:
         self._plain = {name: vars(obstacle)[name] for name in (*ASSIGNED, "course", "pace") if name in vars(obstacle)}
         self._stored = {name: dict(vars(obstacle)[name]) for name in ("_parameters", "_buffers", "_modules")}
 
     def stored(self, obstacle: Obstacle, poses: Poses) -> _Motions:
-        """With tensors of their own, which later writes do not change. What was the same as where the obstacle was left
-        still is."""
+        """Copy that later writes do not change. Values that were identical to the stored ones stay identical."""
         course: Course | None = self._plain["course"]
         left = poses.get(obstacle.key) if course is None else course.after
         same = [] if left is None else _sameness(obstacle, left)
@@ -298,7 +298,7 @@ class _Motions:
 
 
 def obstacles_of(step: Any) -> Sequence[Obstacle]:
-    """Those of a `Step` and of its heat, or of a module that has some."""
+    """Obstacles of a `Step` and of its heat, or of a module that contains steps."""
     Step, Obstacle = _classes()
     if not isinstance(step, torch.nn.Module):
         return []
@@ -309,7 +309,7 @@ def obstacles_of(step: Any) -> Sequence[Obstacle]:
 
 @functools.cache
 def _classes() -> tuple[Any, Any]:
-    """Which import this module."""
+    """Classes of modules that import this one."""
     from ..step.step import Step
     from .obstacles import Obstacle
 
@@ -321,14 +321,14 @@ def _unchanged(state: State) -> State:
 
 
 def _underway(course: Course) -> Left:
-    """Where an obstacle is left in the middle of a control step."""
+    """Pose of an obstacle to store in the middle of a control step."""
     if course.during is None:
         return course.after
     return course.after._replace(moves=course.during, arrives=False)
 
 
 def _leave(state: State, obstacles: Sequence[Obstacle]) -> State:
-    """A state that stores where its obstacles are."""
+    """A state with the poses of its obstacles."""
     poses = {key: left for key, left in state.poses.items() if key() is not None}
     for obstacle in obstacles:
         assert obstacle.course is not None
@@ -367,7 +367,7 @@ def _count(step: Any, wrong: Tensor) -> None:
 
 
 def course_of(obstacle: Obstacle, left: Left | None, span: Span, device: torch.device) -> Course:
-    """How an obstacle moves in a control step, from where a state has left it; None for nowhere."""
+    """Course of an obstacle in a control step, from its stored pose; None without one."""
     if left is None or left.placements != obstacle.placements:
         return Course(None, _left_at(obstacle))
     same = _sameness(obstacle, left)
@@ -400,7 +400,7 @@ def _values(motion: RigidMotion) -> tuple[Any, ...]:
 
 
 def _motion(values: Sequence[Any]) -> RigidMotion:
-    """The motion of values that `_values` returns; by hand, since attributes of modules take microseconds each."""
+    """Motion with the values of `_values`, without its constructor: attributes of modules take microseconds each."""
     *assigned, start, end = values
     motion = RigidMotion.__new__(RigidMotion)
     for name, value in zip(ASSIGNED, assigned, strict=True):
@@ -413,7 +413,7 @@ def _motion(values: Sequence[Any]) -> RigidMotion:
 
 
 def _assigned(motion: RigidMotion) -> tuple[Any, ...]:
-    """The attributes by which it moves. Found by hand: `getattr` of a buffer takes a microsecond."""
+    """Attributes that define the motion. Read from dictionaries: `getattr` of a buffer takes a microsecond."""
     plain, buffers, parameters = vars(motion), motion._buffers, motion._parameters
     return tuple(
         plain[name]
@@ -428,7 +428,7 @@ def _assigned(motion: RigidMotion) -> tuple[Any, ...]:
 
 
 def _sameness(obstacle: Obstacle, left: Left) -> list[bool]:
-    """Whether each attribute is as it was."""
+    """Whether each attribute is unchanged."""
     return [is_same(known, value) for known, value in zip(left.given, _assigned(obstacle), strict=True)]
 
 
@@ -437,7 +437,7 @@ def _is_as_left(obstacle: Obstacle, left: Left) -> bool:
 
 
 def _copy(name: str, value: Any) -> Any:
-    """A value that stays as it is when tensors and lists are written to; differentiable."""
+    """Copy of a value, independent of later writes to tensors and lists; differentiable."""
     if isinstance(value, Tensor):
         return value.clone()
     return value if value is None or isinstance(value, (tuple, float)) or callable(value) else finite(name, value)
@@ -457,7 +457,7 @@ class _Part(NamedTuple):
 
 
 def _part(turns: bool, obstacle: Obstacle, later: Left, changes: _Changes, same: Sequence[bool]) -> _Part:
-    """The centre, or the rotation."""
+    """The part of the centre, or of the rotation."""
     own, before = later.values[2 * turns : 2 * turns + 2], _values(changes.before)[2 * turns : 2 * turns + 2]
     if all(value is None for value in (*own, *before)):
         return _Part(own, own)
@@ -481,14 +481,14 @@ class _Changes:
     Centres [D] or [B, D]; angles [] or [B]; rotation vectors [3] or [B, 3].
 
     Args:
-        left: where the obstacle was left.
+        left: stored pose and motion of the obstacle.
         span: the control step.
         start: time at which a pose is given, and from which its rate counts [s].
         device: of the particles.
 
     Attributes:
-        before: how the obstacle has moved.
-        turns: whether rotations are meant, or centres.
+        before: motion of the obstacle so far.
+        turns: whether the poses are rotations, not centres.
     """
 
     def __init__(self, left: Left, span: Span, start: float, device: torch.device) -> None:
@@ -509,22 +509,22 @@ class _Changes:
         return value.to(self.like) if isinstance(value, Tensor) else filled(value, self.like)
 
     def pose(self) -> Tensor:
-        """Where the obstacle was left."""
+        """Stored pose of the obstacle."""
         if not self.turns:
             return self._centre
         turn = self._times(self.value(self.before.angular_velocity), self._elapsed)
         return self._moved(self.value(self.before.rotation), turn)
 
     def on_path(self, obstacle: Obstacle) -> Tensor:
-        """Where the path of an obstacle begins."""
+        """First point of the path of an obstacle."""
         return _motion(_values(obstacle)).centre_at(self._span.begin, self.like)
 
     def backwards(self, pose: Tensor, rate: Any) -> Tensor:
-        """The pose at `start` of one at the beginning of the control step."""
+        """Pose at `start`, from the pose at the beginning of the control step."""
         return pose if rate is None else self._moved(pose, self._times(self.value(rate), -self._elapsed))
 
     def to(self, target: Any) -> _Part:
-        """Uniformly to a pose, which is reached at the end."""
+        """Uniform motion to a pose, which is reached at the end."""
         pose, end = self.pose(), self.value(target)
         lasts = self._seconds > 0
         share = torch.where(lasts, 1 / torch.where(lasts, self._seconds, 1.0), 0.0)
@@ -535,7 +535,7 @@ class _Changes:
         return _Part(during, (torch.where(self._column(lasts), end, pose), None), False, True)
 
     def jump(self, pose: Tensor, rate: Any) -> Tensor:
-        """Scenes in which a pose is not the one in which the obstacle was left, bool [] or [B]."""
+        """Scenes in which a pose differs from the stored one, bool [] or [B]."""
         before = self.pose()
         way = self._size(self._times(self.value(rate), self._seconds))
         rounding = 64 * torch.finfo(torch.float32).eps * (self._size(pose) + self._size(before))
@@ -572,7 +572,7 @@ class _Changes:
         return composed(way, pose) if self.turns and self._rank else pose + way
 
     def _way(self, begin: Tensor, end: Tensor) -> Tensor:
-        """From one pose to another; of rotations the shortest."""
+        """Displacement from one pose to another; for rotations the shortest one."""
         if not self.turns:
             return end - begin
         if self._rank:

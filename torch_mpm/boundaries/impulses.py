@@ -73,7 +73,7 @@ class Impulses:
         of `FACES`.
 
         Raises:
-            KeyError: where there is no such boundary.
+            KeyError: the step has no such boundary.
         """
         values = self.values[:, self._place(boundary)]
         dim = self._dim

@@ -1,4 +1,4 @@
-"""Rigid motion: where a body is at a time, and how fast its matter moves."""
+"""Rigid motion: pose of a body at a time, and velocity of its matter."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ REFUSALS = RuntimeError, TypeError, ValueError
 
 
 class Pose(NamedTuple):
-    """Where a body is: world = centre + rotation @ body."""
+    """Pose of a body: world = centre + rotation @ body."""
 
     centre: Tensor  # [D] or [B, D]
     rotation: Tensor  # [D, D] or [B, D, D]
@@ -34,7 +34,7 @@ class Pose(NamedTuple):
 class RigidMotion(SceneParameters):
     """A body that moves and turns at constant rates from time `start` on, or along a path.
 
-    While a call of a step lasts, `control` may be another motion that takes its place; see `boundaries.control`.
+    During a call of a step another motion, `control`, may replace it; see `boundaries.control`.
 
     Args:
         position: of its centre at time `start` [m]: D numbers, a tensor [D] or [B, D], or a function of the time, a
@@ -66,7 +66,7 @@ class RigidMotion(SceneParameters):
         self.start = float(start)
         self.end = math.inf
         self.pace: float | Tensor = PACE
-        """Length of the steps [s], over which a path is differenced; not beyond `end`."""
+        """Length of the steps [s], over which a path is differenced, up to `end`."""
 
     @property
     def motion(self) -> RigidMotion:
@@ -95,7 +95,7 @@ class RigidMotion(SceneParameters):
         return Pose(centre, torch.eye(dim, dtype=like.dtype, device=like.device) if rotation is None else rotation)
 
     def centre_at(self, time: float | Tensor, like: Tensor) -> Tensor:
-        """[D] or [B, D]."""
+        """Centre at a time, [D] or [B, D]."""
         motion = self.motion
         if self.follows_path:
             return motion.at(_as_time(time, like)).to(like.dtype)
@@ -106,7 +106,7 @@ class RigidMotion(SceneParameters):
         return position + velocity * _column(self._elapsed(time, like), 1)
 
     def rotation_at(self, time: float | Tensor, like: Tensor, dim: int) -> Tensor | None:
-        """[D, D] or [B, D, D]; None where the body never turns."""
+        """Rotation at a time, [D, D] or [B, D, D]; None for a body that never turns."""
         shape = () if dim == 2 else (3,)
         rotation, motion = None, self.motion
         if motion.rotation is not None:
@@ -135,15 +135,15 @@ class RigidMotion(SceneParameters):
         return swirl if result is None else result + swirl
 
     def _path(self, time: float | Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
-        """Centre and its velocity where the position is a function of time."""
+        """Centre and its velocity, for a position that is a function of time."""
         centre, velocity = self._moved(_as_time(time, like))
         return centre.to(like.dtype), velocity.to(like.dtype)
 
     def path_over(self, times: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
         """Centre and its velocity at many times [n] or [n, B]: [n, 1 or B, D], with the dtype of `like`.
 
-        A function of time is called for all of them at once if it can be mapped over them (torch.vmap), else for one
-        after another; three times, once to differentiate it and once to difference it.
+        A function of time is called for all times at once if torch.vmap can map it, otherwise for one after another. It
+        is called three times: for its value, its derivative and its difference.
         """
         centre = self._mapped(times)
         if centre.dim() not in (2, 3) or centre.shape[-1] != like.shape[1]:
@@ -172,7 +172,7 @@ class RigidMotion(SceneParameters):
             return torch.stack([self.at(time) for time in times.unbind()])
 
     def _rates(self, times: Tensor, centre: Tensor) -> Tensor:
-        """Derivatives of centres by their times, zero where they have none. Backward, where a time has one centre:
+        """Derivatives of centres by their times, zero without one. In reverse mode for one centre per time, since
         forward mode imports compilers, which takes a second."""
         if centre.dim() > times.dim() + 1:
             return torch.stack([self._derivative(time)[1] for time in times.unbind()])
@@ -198,7 +198,7 @@ class RigidMotion(SceneParameters):
         return centre, self._differenced(self.at, time, centre, rate)
 
     def _derivative(self, time: Tensor) -> tuple[Tensor, Tensor]:
-        """Position on the path and its derivative, zero where it has none."""
+        """Position on the path and its derivative, zero without one."""
         try:
             centre, rate, *_ = torch.func.jvp(self.at, (time,), (torch.ones_like(time),))
         except torch.OutOfMemoryError:
@@ -209,8 +209,8 @@ class RigidMotion(SceneParameters):
         return centre, rate
 
     def _differenced(self, path: Callable[[Tensor], Tensor], times: Tensor, centre: Tensor, rate: Tensor) -> Tensor:
-        """The derivative of a path, or its difference over a step where the derivative is zero: a path of numbers has
-        none. Where a path rests both are zero."""
+        """The derivative of a path, or its difference over a step if that is zero: a path of numbers has none.
+        Both are zero for a path at rest."""
         if isinstance(self.position, Waypoints):  # whose derivative is exact
             return rate
         resolution = 4 * torch.finfo(times.dtype).eps * times.abs()

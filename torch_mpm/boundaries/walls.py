@@ -13,11 +13,12 @@ from ..errors import check_number, check_numbers
 CONTACTS = ("sticky", "slip", "separate")
 WALL_KINDS = (*CONTACTS, "mirror", "open")
 LEAST_BETWEEN_MIRRORS = 5
-"""Cells between a mirror and the wall opposite it, so that no node has two images (csrc/grid/grid_update.h)."""
+"""Least number of cells between a mirror and the opposite wall, so that no node has two images
+(csrc/grid/grid_update.h)."""
 
 
 class Face(NamedTuple):
-    """One side of the domain: what happens to nodes at or beyond `plane` [m]."""
+    """One side of the domain: the contact condition of nodes at or beyond `plane` [m]."""
 
     kind: str
     plane: float
@@ -42,8 +43,8 @@ class Walls:
     after another in the order of the axes.
 
     A "mirror" is a frictionless wall of second order in dx, where "slip" is of first: nodes near it get the velocity
-    that the particles and their images behind the wall would give together, so particles at the wall find there what
-    they would in the middle of a body. It must lie on a node or halfway between two, and `LEAST_BETWEEN_MIRRORS` cells
+    of the particles together with their images behind the wall, so particles at the wall move as in the middle of a
+    body. It must lie on a node or halfway between two, and `LEAST_BETWEEN_MIRRORS` cells
     from the wall opposite. It acts before the other faces and obstacles, whose effect on a node it does not reflect.
 
     Args:
@@ -104,7 +105,7 @@ class Walls:
         return faces
 
     def mirrors(self) -> Walls | None:
-        """The mirrors alone, all other faces open; None where there are none."""
+        """The mirrors alone, all other faces open; None without mirrors."""
         if "mirror" not in _flat(self.kind):
             return None
         return Walls(_replaced(self.kind, {name: "open" for name in CONTACTS}), self.lower, self.upper)
@@ -142,7 +143,7 @@ def _numbers(name: str, values: Sequence[float] | None) -> tuple[float, ...] | N
 
 
 def _frozen(value: Any) -> Any:
-    """Nested sequences as tuples, which cannot change behind the faces kept by `Walls`."""
+    """Nested sequences as tuples, which cannot change after `Walls` has read them."""
     if isinstance(value, str) or not isinstance(value, Sequence):
         return value
     return tuple(_frozen(item) for item in value)

@@ -1,4 +1,4 @@
-"""Paths through given points: for an obstacle that a controller or a table moves."""
+"""Paths through given points, for obstacles that follow a controller or a table."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from ..laws.parameters import check_knots, store
 
 
 class Waypoints(nn.Module):
-    """A path through points at given times, straight in between; it stands still before the first and from the last on.
+    """A piecewise linear path through points at given times, at rest before the first and after the last.
 
         path = torch.nn.Parameter(points)  # [K, D]
         hand = torch_mpm.Sphere(torch_mpm.Waypoints(times, path), radius=0.1)
 
     Args:
         time: K increasing numbers [s], two or more; or a tensor [K].
-        position: of each [m], a tensor [K, D] that may require grad, or K lists of D numbers.
+        position: the points [m], a tensor [K, D] that may require grad, or K lists of D numbers.
 
     Raises:
         ValueError: for times that do not increase, numbers that are not finite, or different lengths.

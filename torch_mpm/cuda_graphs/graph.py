@@ -43,12 +43,12 @@ class WorkInFlight:
 
 
 class Replays:
-    """A graph of a function state -> state, of one step or of some, that leaves its state where it has found it.
+    """A CUDA graph of a function state -> state, of one step or several, which updates its state in place.
 
     Args:
-        function: what is recorded; it must not wait for the device.
+        function: the function; it must not wait for the device.
         state: the state before the first replay; `Replays.state` is that after the last one.
-        blocks: of the pool of its activations.
+        blocks: number of blocks of the pool of its activations.
     """
 
     def __init__(self, function: Callable[[State], State], state: State, blocks: int) -> None:

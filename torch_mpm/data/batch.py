@@ -38,7 +38,7 @@ def substeps(built: Built, interval: float, cfl: float, dt: float | None = None)
     """
     if dt is not None:
         return [math.ceil(interval / dt * (1 - 1e-9))] * built.grid.scenes
-    rates: list[float] = built.step.survey(_falling(built)).rate.tolist()
+    rates: list[float] = built.step.stability_report(_falling(built)).rate.tolist()
     return [max(1.0, math.ceil(interval * rate / cfl * (1 - 1e-9))) if rate < math.inf else rate for rate in rates]
 
 
@@ -103,21 +103,21 @@ def simulate(
         shapes = shapes_of(names, built.grid.dim)
         recording = Recording(frames, particles_of(built), shapes, built.state.x.device, executor, packed, behind)
         try:
-            surveys = _run(built, recording, names, frames, interval, count, told)
+            reports = _run(built, recording, names, frames, interval, count, told)
             recorded = recording.finish()
         except BaseException:
             recording.abandon()
             raise
         if _had_room(built):
-            return recorded, _failures(built, surveys, interval / count, frames)
+            return recorded, _failures(built, reports, interval / count, frames)
 
 
 def _run(
     built: Built, recording: Recording, names: Sequence[str], frames: int, interval: float, count: int,
     told: Told | None,
 ) -> Tensor:  # fmt: skip
-    """Queue all frames; returns the results of surveys, float64 [surveys, 3, B] on the device."""
-    step, state, surveys = built.step, step_ready(built), []
+    """Queue all frames; returns the results of reports, float64 [reports, 3, B] on the device."""
+    step, state, reports = built.step, step_ready(built), []
     order = torch.argsort(state.ids)  # type: ignore[arg-type]
     for frame in range(frames):
         if frame:
@@ -125,14 +125,14 @@ def _run(
         if frame % LOOK == 0 or frame == frames - 1:
             state = step.sorted(state)
             order = torch.argsort(state.ids)  # type: ignore[arg-type]
-            surveys.append(torch.stack(step.survey(state)))
+            reports.append(torch.stack(step.stability_report(state)))
             if state.x.is_cpu:
                 heap.trim()
         taken = _take_all([_field(built, state, name) for name in names], order)
         recording.put(dict(zip(names, taken, strict=True)))
         if told is not None:
             told(frame)
-    return torch.stack(surveys)
+    return torch.stack(reports)
 
 
 def step_ready(built: Built) -> State:
@@ -193,14 +193,14 @@ def _had_room(built: Built) -> bool:
 # ---- failures
 
 
-def _failures(built: Built, surveys: Tensor, dt: float, frames: int) -> list[str]:
+def _failures(built: Built, reports: Tensor, dt: float, frames: int) -> list[str]:
     """Reason of the failure of each scene; "" for a valid one. Waits for the device."""
     texts: list[list[str]] = [[] for _ in range(built.grid.scenes)]
     for problem in built.step.failures().problems.values():
         for scene, number in enumerate(problem.count.tolist()):
             if number:
                 texts[scene].append(f"{number} {problem.what}")
-    for look, (rates, _, wrong) in enumerate(surveys.tolist()):
+    for look, (rates, _, wrong) in enumerate(reports.tolist()):
         frame = min(look * LOOK, frames - 1)
         for scene, text in enumerate(texts):
             if not text and wrong[scene]:

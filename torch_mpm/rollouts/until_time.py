@@ -233,7 +233,7 @@ class Clocks:
 
     def _limit(self, state: State) -> Tensor:
         """Longest stable dt of each scene; the previous dt becomes a fraction of it."""
-        limit = 1 / self.step.survey(state, judge=False).rate
+        limit = 1 / self.step.stability_report(state, with_energy=False).rate
         self._count_cfl(limit, self.substeps > 0)
         return limit
 

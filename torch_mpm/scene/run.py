@@ -24,7 +24,7 @@ from ..laws import Mixture
 from ..rollouts import rollout
 from ..state import state_file
 from ..state.state import State, _take_all
-from ..step.stability import Figures
+from ..step.stability import LawDiagnostics
 from . import fields, heap
 from .build import Built
 from .diagnose import SceneFailure, replay, wrong
@@ -158,7 +158,7 @@ class Moved(NamedTuple):
     """State after a segment, reordered."""
 
     state: State
-    survey: list[list[float]]
+    report: list[list[float]]
     status: list[list[float]]
     shown: Shown | None
     """State in the form of a frame."""
@@ -176,7 +176,7 @@ class Simulation:
         self.emitted = 0
         self.fingerprint = ""
         self._figures: dict[str, Any] = {}
-        self._survey: list[list[float]] | None = None  # Rates, speeds and invalid particles of the present state.
+        self._report: list[list[float]] | None = None  # Rates, speeds and invalid particles of the present state.
         self._copier = Copier()
         self._shown: Shown | None = None  # Of the present state, at the end of a frame.
         origin = scene.origin
@@ -290,7 +290,7 @@ class Simulation:
             self._check_stop(stop)
 
         if self.frame < 0:
-            copies, sums = self._show(self.state, self._law_figures(self.state))
+            copies, sums = self._show(self.state, self._law_diagnostics(self.state))
             self._shown = Shown(copies, on_host(sums))
             due = self._complete(0, 0.0, 0.0)
         try:
@@ -339,7 +339,7 @@ class Simulation:
         }
         return Frame(self.frame, copies, scalars, state_file.tensors_of(state), record)
 
-    def _show(self, state: State, figures: Figures) -> tuple[Copies, dict[str, Tensor]]:
+    def _show(self, state: State, diagnostics: LawDiagnostics) -> tuple[Copies, dict[str, Tensor]]:
         """Copies and sums of a state for the next frame, without waiting for them."""
         given = self.step.prepare(state)
         assert given.ids is not None
@@ -347,18 +347,18 @@ class Simulation:
         order = torch.empty_like(places).scatter_(0, given.ids, places)
         values = {}
         for name in ("position", "velocity", *self.scene.trajectory_fields):
-            value = fields.field(self.step, given, name, figures.stress)
+            value = fields.field(self.step, given, name, diagnostics.stress)
             assert value is not None, name  # `build` refuses fields that no material has.
             values[name] = self._in_coordinates(value) if name == "position" else value
         kept = dict(zip(values, _take_all(list(values.values()), order), strict=True))
-        return self._copier.begin(kept), energies(self.step, state, figures)
+        return self._copier.begin(kept), energies(self.step, state, diagnostics)
 
     def _in_coordinates(self, x: Tensor) -> Tensor:
         """Positions in the coordinates of the scene file; in float64 where they are relative to an origin."""
         return x if self._origin is None else x.double() + self._origin
 
-    def _law_figures(self, state: State) -> Figures:
-        return self.step.figures(fields.with_C(state) if self.step.law.viscous else state)
+    def _law_diagnostics(self, state: State) -> LawDiagnostics:
+        return self.step.diagnostics(fields.with_C(state) if self.step.law.viscous else state)
 
     # -- time
 
@@ -371,10 +371,10 @@ class Simulation:
         rounding = 1e-9 * (end - begin)
         while now < end - rounding:
             self._emit(now + rounding)
-            if self._survey is None:
+            if self._report is None:
                 self.state = self.step.sorted(self.state.replace(time=now))
-                self._survey = torch.stack(self.step.survey(self.state)).tolist()
-            rates, speeds, _ = self._survey
+                self._report = torch.stack(self.step.stability_report(self.state)).tolist()
+            rates, speeds, _ = self._report
             following = self.emissions[self.emitted][0] if self.emitted < len(self.emissions) else math.inf
             target = min(end, following) if following > now + rounding else end
             dt, count = self._choose_dt(target - now, rates)
@@ -403,7 +403,7 @@ class Simulation:
             scene = self.built.scenes[rates.index(rate)]
             raise SceneFailure(
                 f"{scene + ', ' if scene else ''}step {self.totals.substeps}: dt = {self.scene.dt:g} s is above the "
-                f"stability limit {limit:.3g} s; use dt = {0.5 * limit:.2g}, or leave dt out and set cfl = 0.5."
+                f"stability limit {limit:.3g} s; use dt = {0.5 * limit:.2g}, or remove dt and set cfl = 0.5."
             )
         self.totals.limits = [*self.totals.limits, limit][-LIMITS:]
         wanted = self.scene.dt or self.scene.cfl * min(self.totals.limits)
@@ -412,8 +412,8 @@ class Simulation:
 
     def _most_after(self, rates: list[float]) -> int:
         """Maximum number of substeps of the next segment, after one that began with these limits."""
-        assert self._survey is not None
-        before, after = max(rates, default=0.0), max(self._survey[0], default=0.0)
+        assert self._report is not None
+        before, after = max(rates, default=0.0), max(self._report[0], default=0.0)
         device = self.state.x.device.type
         if after > STEADY * before:
             return UNSTEADY_SEGMENT[device]
@@ -429,13 +429,13 @@ class Simulation:
         good, dt, steps = self.state, segment.dt, segment.steps
         try:
             moved = self._moved(segment, meanwhile)
-            if steps > SEGMENT and not dt * max(moved.survey[0], default=0.0) <= 1:
+            if steps > SEGMENT and not dt * max(moved.report[0], default=0.0) <= 1:
                 raise SimulationError("dt is above the limit")
             if any(row[Status.PROBLEM_ACTIVATION] >= 0 for row in moved.status) or self.step.heat is not None:
                 self.step.check()
-            bad = wrong(self.step, moved.state, self.scene.origin) if any(moved.survey[2]) else None
+            bad = wrong(self.step, moved.state, self.scene.origin) if any(moved.report[2]) else None
             if bad is None:
-                self._survey, self.state, self._shown = moved.survey, moved.state, moved.shown
+                self._report, self.state, self._shown = moved.report, moved.state, moved.shown
                 return True
             message = bad[1]
         except SimulationError as error:
@@ -456,18 +456,18 @@ class Simulation:
         room = self.step.grid.max_blocks
         end = rollout(self.step, self.state, segment.steps, segment.dt).replace(time=segment.until)
         ordered = self.step.sorted(end)
-        figures = self._law_figures(ordered)
-        told = {"survey": torch.stack(self.step.survey(ordered, figures=figures))}
+        diagnostics = self._law_diagnostics(ordered)
+        results = {"report": torch.stack(self.step.stability_report(ordered, diagnostics=diagnostics))}
         if self.step.status is not None:
-            told["status"] = self.step.status
-        copies, sums = self._show(ordered, figures) if segment.shows else (None, {})
+            results["status"] = self.step.status
+        copies, sums = self._show(ordered, diagnostics) if segment.shows else (None, {})
         meanwhile()
-        found = on_host(told | sums)
-        survey, status = found.pop("survey"), found.pop("status", [])
+        found = on_host(results | sums)
+        report, status = found.pop("report"), found.pop("status", [])
         if self._overflowed(status, room):
             self.step.reset()
             return self._moved(segment, meanwhile)
-        return Moved(ordered, survey, status, None if copies is None else Shown(copies, found))
+        return Moved(ordered, report, status, None if copies is None else Shown(copies, found))
 
     def _overflowed(self, status: list[list[float]], room: int | None) -> bool:
         """Whether a pool of blocks that grows with the scene, with some margin before a segment, was too small for
@@ -488,7 +488,7 @@ class Simulation:
             ids = torch.arange(len(self.state), len(self.state) + len(layer), device=layer.x.device)
             self.state = joined(self.state, layer.replace(ids=ids))
             self.emitted += 1
-            self._survey = None
+            self._report = None
 
     # -- the end
 
@@ -523,13 +523,13 @@ def joined(state: State, layer: State) -> State:
     return State.concatenate([state, layer.replace(time=state.time)])
 
 
-def energies(step: Any, state: Any, figures: Figures) -> dict[str, Tensor]:
+def energies(step: Any, state: Any, diagnostics: LawDiagnostics) -> dict[str, Tensor]:
     """Kinetic, elastic and potential energy [J], momentum [kg m/s] and heat [J] of all particles, summed in float64."""
     mass = state.mass.double()[:, None]
     momentum = mass * state.v
     sums = {
         "kinetic_energy": 0.5 * (momentum * state.v).sum(),
-        "elastic_energy": (state.volume * figures.energy).sum(dtype=torch.float64),
+        "elastic_energy": (state.volume * diagnostics.energy).sum(dtype=torch.float64),
         "momentum": momentum.sum(0),
     }
     if step.gravity is not None:

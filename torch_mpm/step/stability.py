@@ -60,8 +60,8 @@ GRADIENT_BOUND = {
 }
 
 
-class Figures(NamedTuple):
-    """Values of a law at the particles, for a survey."""
+class LawDiagnostics(NamedTuple):
+    """Values of a law at the particles, for a stability report."""
 
     stress: Tensor
     """Kirchhoff stress [P, D, D] [Pa]."""
@@ -121,7 +121,7 @@ def stable_dt(
         raise ValueError(f"stress_form must be 'gradient' or 'mls', got {stress_form!r}")
     law.check_parameters(len(state), grid.scenes)
     state = state.of_scenes(grid.scenes)
-    found = look(grid, law, state, figures_of(law, state, False), transfer, stress_form, speed)
+    found = stability_report(grid, law, state, law_diagnostics(law, state, False), transfer, stress_form, speed)
     return chosen_dt(cfl / found.rate, previous).to(state.x.dtype)
 
 
@@ -147,39 +147,40 @@ def chosen_dt(longest: Tensor, previous: float | Tensor | None) -> Tensor:
 
 
 @torch.no_grad()
-def look(
+def stability_report(
     grid: Grid,
     law: Material,
     state: State,
-    figures: Figures,
+    diagnostics: LawDiagnostics,
     transfer: str,
     stress_form: str,
     speed: Tensor | None = None,
     obstacles: Sequence[Obstacle] = (),
 ) -> Survey:
-    """`survey` of a state that has all fields, with the values of the law."""
+    """Limit of the time step, speed and validity of each scene, for a state with all fields."""
     grid.check_resolution(state.x.dtype)
     bound = GRADIENT_BOUND[stress_form, grid.kernel] / grid.dx**2
     return survey(
         grid,
         state,
-        figures.stress,
-        figures.stiffness,
+        diagnostics.stress,
+        diagnostics.stiffness,
         bound,
         kept=2.0 if transfer == "apic" and stress_form == "mls" else 1.0,  # 1 + s
         volumetric="J" in law.state_fields,
         viscosity=law.viscosity(state),
-        energy=figures.energy,
+        energy=diagnostics.energy,
         speed=speed,
         obstacles=obstacles,
         reach=2 * math.sqrt(grid.dim) * grid.dx,  # largest distance of a particle's nodes
     )
 
 
-def figures_of(law: Material, state: State, judge: bool) -> Figures:
-    """Stress, stiffness and, with `judge`, energy density of a law."""
+def law_diagnostics(law: Material, state: State, with_energy: bool) -> LawDiagnostics:
+    """Stress, stiffness and, with `with_energy`, energy density of a law."""
     if all(isinstance(part, CompiledLaw) and part.figures_are_compiled() for part in laws_of(law)):
         calls = law_calls(law, state)
         how = calls.names, calls.options, calls.parameters, calls.history, calls.variables
-        return Figures(*law_figures(state, *how, calls.material, judge))
-    return Figures(law.stress(state), law.stiffness(state), law.energy_density(state) if judge else None)
+        return LawDiagnostics(*law_figures(state, *how, calls.material, with_energy))
+    energy = law.energy_density(state) if with_energy else None
+    return LawDiagnostics(law.stress(state), law.stiffness(state), energy)

@@ -37,16 +37,16 @@ from .clocks import time_after
 from .failures import Failures, problems_of_state, raise_failures
 from .particle_operations import ParticleOperation, operated
 from .pause import paused, standing
-from .stability import Figures, chosen_dt, figures_of, look
+from .stability import LawDiagnostics, chosen_dt, law_diagnostics, stability_report
 from .status import ActivationRecord
 
 TRANSFERS = ("apic", "pic", "flip")
 
 
 class Boundary(Protocol):
-    """What acts on the grid velocity [N, D] of nodes at positions [N, D]; see `torch_mpm.boundaries`.
+    """A boundary, which changes the grid velocity [N, D] of nodes at positions [N, D]; see `torch_mpm.boundaries`.
 
-    A module may have the same as `forward`.
+    A module may have `forward` with these arguments instead.
     """
 
     def apply(
@@ -59,10 +59,10 @@ class Step(TensorModule):
 
     Args:
         grid: the lattice.
-        law: a material; or a function or module F [P, D, D] -> Kirchhoff stress, of which `CustomLaw` makes one.
+        law: a material; or a function or module F [P, D, D] -> Kirchhoff stress, which becomes a `CustomLaw`.
         gravity: [m/s²]; D numbers, or a tensor [D] or [B, D] that may require grad, on the device of the particles, a
             buffer or parameter of the step; None for none.
-        walls: "slip", "sticky", "separate" or "mirror" on every face of the domain, a `Walls` that says more, or None.
+        walls: "slip", "sticky", "separate" or "mirror" on every face of the domain, a `Walls`, or None.
         boundaries: obstacles with the interface of `torch_mpm.boundaries`, applied in order; a list that may change.
         transfer: "apic" (Jiang et al. 2015), "pic", or "flip". All keep momentum; only "apic" keeps angular momentum
             too, and "pic" damps strongly (docs/limitations.md).
@@ -75,16 +75,16 @@ class Step(TensorModule):
             [P]: particles that are not enabled take no part in the step and stay as they are. The time is that of the
             start of the step, and the number of particles stays.
         heat: conduction of heat in the same particles, see `Heat`; the state then needs a temperature.
-        compensated: whether what rounding leaves out of the positions is carried on (`State.x_residual`, compensated
-            summation), so that slow motion in small steps is not lost. None decides by the lattice, the dtype and dt:
-            where rounding may change the motion of a step by more than a thousandth at 1 m/s, or at the length of the
-            domain in a second where that is less. A state that has a residual keeps it. A tensor dt on CUDA is read
-            once, at the first such step, and later ones count as alike.
+        compensated: whether the rounding error of positions is stored (`State.x_residual`, compensated summation), so
+            that slow motion in small steps is not lost. None decides by the lattice, the dtype and dt: positions are
+            compensated if rounding may change the motion of a step by more than a thousandth, at 1 m/s or, if less, at
+            one length of the domain per second. A state with a residual keeps it. A tensor dt on CUDA is read once, at
+            the first such step, and later ones are assumed to be alike.
         integrator: "explicit"; or "implicit" or an `Implicit`, which solves for the node velocities with the forces at
             the end of the step (backward Euler), so that stiffness does not limit dt.
 
-    A step without boundaries, walls, gravity, FLIP or heat does not pay for them. The arguments are attributes, which
-    may be assigned in the forms of the arguments. Forward hooks act on the step, its law and its boundaries; backward
+    Unused features cost nothing: boundaries, walls, gravity, FLIP, heat. The arguments are attributes, which may be
+    assigned in the forms of the arguments. Forward hooks act on the step, its law and its boundaries; backward
     hooks on the law, whose output is a tensor.
 
     Differentiable in reverse mode, by torch.func.grad and vjp too. `torch.compile(step, fullgraph=True)` needs a grid
@@ -149,7 +149,7 @@ class Step(TensorModule):
             self._fit_law()
 
     def _fit_law(self) -> None:
-        """What the law reads of a step, and what the step wants of its law."""
+        """Pass settings of the step to its law, and settings of the law to the step."""
         parts = list(self.law.modules())
         self._rate_dependent = any(getattr(part, "rate_dependent", False) for part in parts)
         heat = getattr(self, "heat", None)
@@ -196,7 +196,7 @@ class Step(TensorModule):
             return self._moved(state, dt)
         before, as_now = state, motions_now(self, state)
         state, enabled = operated(self.on_particles, state, dt)
-        state = self.prepare(state)  # of which a function may have made another
+        state = self.prepare(state)  # a function may have made another one
         with as_now():
             if enabled is None:
                 return self._moved(state, dt)
@@ -204,7 +204,7 @@ class Step(TensorModule):
             return standing(before, self._moved(state.replace(mass=mass, volume=volume), dt), enabled)
 
     def _moved(self, state: State, dt: float | Tensor) -> State:
-        """A prepared state one step later, without what acts on the particles before."""
+        """A prepared state one step later, without `on_particles`."""
         grid, law, scene = self.grid, self.law, state.scene
         law.check_parameters(len(state), grid.scenes)
         self._activations.begin(state, grid.scenes)
@@ -233,7 +233,7 @@ class Step(TensorModule):
             affine=keeps_C or self.heat is not None,
             stress_form=form,
         )
-        if self._flip_share:  # positions move with the grid all the same, so that FLIP's noise does not reach them
+        if self._flip_share:  # positions move with the grid velocity, so that FLIP's noise does not reach them
             v, impulse = self._blend_flip(blocks, state, affine, v, impulse)
         changes: dict[str, Any] = {**fields, "F": F, "J": J, "x_residual": residual}
         if state.impulse is not None and impulse is not None:
@@ -245,7 +245,7 @@ class Step(TensorModule):
         return state.replace(x=x, v=v, C=C if keeps_C else None, time=time_after(state.time, dt), **changes)
 
     def prepare(self, state: State) -> State:
-        """Give a state the fields that this step needs and that it lacks."""
+        """A state with all fields that this step needs."""
         check_state(state)
         state.check_assigned()
         law = self.law
@@ -262,10 +262,10 @@ class Step(TensorModule):
         return state if self.heat is None else self.heat.prepare(state)
 
     def with_residual(self, state: State, dt: float | Tensor) -> State:
-        """A state whose positions are compensated from here on where steps of dt [s] need it, see `compensated`.
+        """A state whose positions are compensated from here on, if steps of dt [s] need it; see `compensated`.
 
         Warns:
-            PrecisionWarning: where they would need it and `compensated` is False.
+            PrecisionWarning: they need it and `compensated` is False.
         """
         if self.compensated is False:
             self._check_motion(state, dt)
@@ -281,7 +281,7 @@ class Step(TensorModule):
         return resolution.loses_motion(self.grid, state.x.dtype, number)
 
     def _least_dt(self, dt: Tensor) -> float:
-        """The smallest positive entry [s]; infinite where there is none, or it is not known without its values."""
+        """The smallest positive entry [s]; infinite without one, or if it is unknown without its values."""
         cuda = dt.device.type == "cuda"
         if cuda and self._read_dt is not None:
             return self._read_dt
@@ -289,7 +289,7 @@ class Step(TensorModule):
             return math.inf
         values = dt.detach()
         least = float(torch.where(values > 0, values, math.inf).amin()) if values.numel() else math.inf
-        if cuda:  # which has waited
+        if cuda:  # this waited for the device
             self._read_dt = least
         return least
 
@@ -310,7 +310,7 @@ class Step(TensorModule):
         self, blocks: Blocks, nodes: Tensor, state: Any, dt: float | Tensor
     ) -> tuple[Tensor, Tensor | None]:
         """Node velocities of an explicit step [N, D] [m/s] before `on_grid`, from mass and momentum [N, 1 + D], and the
-        impulses on boundaries and walls where the state counts them."""
+        impulses on boundaries and walls if the state counts them."""
         gravity = self.gravity_like(state.x)
         velocity = grid_update(blocks, nodes, gravity, dt, self.walls)
         impulse: Tensor | None = None
@@ -325,9 +325,9 @@ class Step(TensorModule):
     def _implicit_velocity(
         self, blocks: Blocks, state: Any, affine: Tensor | None, stress: Tensor, dt: float | Tensor
     ) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Mass and momentum of the nodes, their velocities with the forces at the end of the step, and impulses as
-        `update_grid` has them, of particles after the return map; forces of explicit materials are those of their
-        stress at its start."""
+        """Mass and momentum of the nodes, their velocities with the forces at the end of the step, and impulses as in
+        `update_grid`, for particles after the return map. Forces of explicit materials are those of their stress at the
+        start of the step."""
         assert self.integrator is not None
         early = self.integrator.explicit_stress(self.law, state, stress)
         impulse = () if early is None else (early, state.volume, dt, self.stress_form)
@@ -336,13 +336,13 @@ class Step(TensorModule):
 
     @property
     def reads_time(self) -> bool:
-        """Whether something that acts on the particles or nodes may look at the time."""
+        """Whether a part of the step may read the time."""
         lists = [self.boundaries] if self.heat is None else [self.boundaries, self.heat.boundaries]
         return self.on_particles is not None or any(boundaries.reads_time for boundaries in lists)
 
     @property
     def solve_report(self) -> ImplicitReport | None:
-        """How the latest implicit step was solved; None before the first, and of explicit steps."""
+        """Report of the latest implicit solve; None before the first one, and for explicit steps."""
         return None if self.integrator is None else self.integrator.report
 
     @property
@@ -359,10 +359,10 @@ class Step(TensorModule):
     ) -> tuple[Tensor, Tensor | None]:
         """(1 − flip) v_pic + flip (v_p + v_pic − Σ N_i v_i), with v_i before the forces (Zhu and Bridson 2005).
 
-        FLIP's share of the particles knows no mirrors but by the change of the velocities, so that of what these take
-        before the forces it keeps its own.
+        Mirrors affect FLIP's share only by the change of the velocities by the forces: it keeps the velocity that the
+        mirrors would remove before the forces.
         """
-        # P2G of the step has the impulse of the stress in it already, which is part of the change.
+        # P2G of the step already includes the impulse of the stress, which is part of the change.
         mirrors = None if self.walls is None else self.walls.mirrors()
         nodes = p2g(blocks, state.x, state.mass, state.v, affine)
         before, _, _ = gather(blocks, state.x, grid_update(blocks, nodes, walls=mirrors))
@@ -385,9 +385,9 @@ class Step(TensorModule):
         return self._kept_gravity.get((gravity, x.dtype, x.device), make, x)
 
     def with_impulses(self, state: State) -> State:
-        """A state that counts impulses: from here on steps add up what the material gives boundaries and walls.
+        """A state that counts impulses: from here on steps accumulate those of the material on boundaries and walls.
 
-        Read them with `impulses`. A state whose `impulse` is None counts none, and pays nothing.
+        Read them with `impulses`. A state whose `impulse` is None counts none, at no cost.
         """
         check_state(state)
         return state.replace(impulse=no_impulse(self, state.x))
@@ -401,7 +401,7 @@ class Step(TensorModule):
         return impulses_of(self, state)
 
     def sorted(self, state: State) -> State:
-        """`State.sorted` for this step: a `Mixture` that has checked the particles need not wait to check them again.
+        """`State.sorted` for this step, after which a `Mixture` does not check its particles again (and wait for it).
 
         Raises:
             GridOverflowError: on the CPU, where a grid of fixed `max_blocks` is full.
@@ -412,58 +412,70 @@ class Step(TensorModule):
         return ordered
 
     def stable_dt(self, state: State, cfl: float = 0.5, previous: float | Tensor | None = None) -> Tensor:
-        """Largest stable time step of each scene [s], [B], times `cfl`; see `torch_mpm.cfl.stable_dt`.
+        """Largest stable time step of each scene [s], [B], times `cfl`; see `torch_mpm.stable_dt`.
 
-        Before every step, or every few, call it with the dt of the step before:
-        `dt = step.stable_dt(state, previous=dt)`, which keeps that dt while the limit allows it and is less than twice
-        as long.
+        Before every step, or every few, call it with the dt of the previous step:
+        `dt = step.stable_dt(state, previous=dt)`. The result is that dt while it is between half of the limit and the
+        limit.
 
-        It has no gradient. Moving obstacles count; what `on_grid` and other boundaries do to the velocities is not
-        known. This is the limit of explicit steps, which implicit ones may exceed; with explicit materials, that of
-        these alone, which they may not.
+        It has no gradient. Moving obstacles count; the effect of `on_grid` and other boundaries on the velocities is
+        not included. Implicit steps may exceed this limit. With explicit materials it is the limit of these materials,
+        which must not be exceeded.
         """
         check_number("cfl", cfl, "positive and finite", lambda v: 0 < v < math.inf)
-        return chosen_dt(cfl / self.survey(state, judge=False).rate, previous).to(state.x.dtype)
+        return chosen_dt(cfl / self.stability_report(state, with_energy=False).rate, previous).to(state.x.dtype)
 
     @torch.no_grad()
-    def figures(self, state: State, judge: bool = True) -> Figures:
-        """Stress, stiffness and, with `judge`, energy density of the law."""
+    def diagnostics(self, state: State, with_energy: bool = True) -> LawDiagnostics:
+        """Stress, stiffness and, with `with_energy`, energy density of the law."""
         check_state(state)
         with full_precision(state.x):
             state = self.prepare(state)
             self.law.check_parameters(len(state), self.grid.scenes)
-            return figures_of(self.law, state, judge)
+            return law_diagnostics(self.law, state, with_energy)
 
     @torch.no_grad()
-    def survey(self, state: State, judge: bool = True, figures: Figures | None = None) -> Survey:
+    def stability_report(
+        self, state: State, with_energy: bool = True, diagnostics: LawDiagnostics | None = None
+    ) -> Survey:
         """Limit of the time step, speed and validity of each scene, without synchronising.
 
         Args:
             state: the particles.
-            judge: whether the energy of the law is asked for too, which tells where the law has no meaning.
-            figures: what `figures` gives for the state, where that is known.
+            with_energy: whether to check the energy of the law, which is not finite for meaningless deformations.
+            diagnostics: result of `diagnostics` for the state, if known.
         """
         check_state(state)
         moving = [b for b in self.boundaries.entries if isinstance(b, Obstacle) and b.moves]
         fused = [b for b in moving if fusible(b, state.time)][:MAX_OBSTACLES]
         others = [b for b in moving if not any(b is kept for kept in fused)]
 
-        def found(law: Material, particles: Any, figures: Figures) -> Survey:
-            return look(
-                *(self.grid, law, particles, figures, "flip" if self._flip_share else self.transfer),
+        def found(law: Material, particles: Any, diagnostics: LawDiagnostics) -> Survey:
+            return stability_report(
+                *(self.grid, law, particles, diagnostics, "flip" if self._flip_share else self.transfer),
                 *(self.stress_form, self._obstacle_speed(others, particles), fused),
             )
 
         with full_precision(state.x):
             state = self.prepare(state)
-            survey = found(self.law, state, figures or self.figures(state, judge))
+            report = found(self.law, state, diagnostics or self.diagnostics(state, with_energy))
             if self.integrator is not None and self.integrator.explicit:
                 law, part = self.integrator.unsolved(self.law, state)
-                survey = survey._replace(rate=found(law, part, figures_of(law, part, False)).rate)
-            return survey
+                report = report._replace(rate=found(law, part, law_diagnostics(law, part, False)).rate)
+            return report
+
+    def figures(self, state: State, judge: bool = True) -> LawDiagnostics:
+        """Old name of `diagnostics`."""
+        warnings.warn("Step.figures is now Step.diagnostics", DeprecationWarning, stacklevel=2)
+        return self.diagnostics(state, judge)
+
+    def survey(self, state: State, judge: bool = True, figures: LawDiagnostics | None = None) -> Survey:
+        """Old name of `stability_report`."""
+        warnings.warn("Step.survey is now Step.stability_report", DeprecationWarning, stacklevel=2)
+        return self.stability_report(state, judge, figures)
 
     def _obstacle_speed(self, obstacles: list[Obstacle], state: Any) -> Tensor | None:
-        """Largest speed of the obstacles that a particle may touch [P] [m/s]; None where there are none."""
+        """Largest speed of the obstacles that a particle may touch [P] [m/s]; None without obstacles."""
         if not obstacles:
             return None
         scene = None if state.scene is None else state.scene.clamp(0, self.grid.scenes - 1)
@@ -477,13 +489,13 @@ class Step(TensorModule):
 
     @torch.no_grad()
     def failures(self, state: State | None = None) -> Failures:
-        """Which scenes went wrong in the steps so far, and how; tensors on the device, which is not waited for.
+        """Failed scenes of the steps so far, with their problems; tensors on the device, without waiting for it.
 
-        A training loop leaves such scenes out by their particles, since zero times the NaN of a lost scene is NaN:
+        A training loop masks such scenes by their particles, since zero times the NaN of a lost scene is NaN:
         `failed = step.failures().failed[state.scene.long()]; v = torch.where(failed[:, None], 0, state.v)`.
 
         Args:
-            state: its masses, volumes, velocities and deformations are looked at too.
+            state: its masses, volumes, velocities and deformations are checked too.
         """
         problems = self._activations.problems(self.grid)
         if self.heat is not None:
@@ -496,9 +508,9 @@ class Step(TensorModule):
         return Failures.of(problems, self.grid.scenes, self._activations.given)
 
     def check(self, state: State | None = None) -> None:
-        """Read the status of all steps so far, and look at a state if one is given; synchronises with the device.
+        """Check the status of all steps so far, and a state if given; synchronises with the device.
 
-        What CUDA graphs replay is among them, if the step had been taken once before it was captured.
+        Replays of CUDA graphs are included, if a step was computed before the capture.
 
         Warns:
             PrecisionWarning: where the positions of the state do not resolve the cells, see `Grid`.
@@ -521,13 +533,13 @@ class Step(TensorModule):
             resolution.check(self.grid, state.x.dtype)
 
     def explain(self, state: State, dt: float | Tensor = 1.0, speed: float | None = None, n: int = 1000) -> str:
-        """How `rollout` takes n steps from a state: the executor and the schedule of its plan, and in a line each why
-        the others were not chosen; see `plan_rollout`.
+        """The plan of `rollout` for n steps in words: executor and schedule, and a line with the reason against each of
+        the others; see `plan_rollout`.
 
         Args:
             state: the particles.
             dt: time step [s].
-            speed: of slow motion [m/s], for which explicit and implicit steps are compared too; waits for the device.
+            speed: speed of slow motion [m/s], to compare explicit and implicit steps too; waits for the device.
             n: number of steps.
 
         Raises:
@@ -551,7 +563,7 @@ class Step(TensorModule):
             self.integrator.reset()
 
     def forget_failures(self, scenes: Tensor) -> None:
-        """Forget the problems of scenes, bool [B] on the device of the particles, which is not waited for."""
+        """Forget the problems of scenes, bool [B] on the device of the particles, without waiting for it."""
         self._activations.forget(scenes)
         if self.heat is not None:
             self.heat.forget(scenes)

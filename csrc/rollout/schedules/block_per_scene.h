@@ -5,22 +5,22 @@
 #include "transfer/advance.h"
 #include "transfer/arguments.h"
 
-// Substeps of scenes that are small enough to stay on one multiprocessor each, on CUDA: a thread block takes a scene
-// through all substeps of a call, its nodes in shared memory, and nobody waits for other scenes.
+// Substeps of scenes that each fit on one multiprocessor, on CUDA: a thread block computes all substeps of a scene in a
+// call, with the nodes in shared memory, and scenes do not wait for each other.
 namespace mpm {
 
-// Bytes at most, of float: of a particle, and of a block with its cells.
+// Largest sizes in bytes, for float: of a particle, and of a block with its cells.
 constexpr int64_t kMostResidentRow = 96, kMostResidentBlock = 1600;
 
-// What went wrong in a scene, and when it did first; zeroed before a call.
+// Errors of a scene, and their first substeps; zeroed before a call.
 struct SceneTrouble {
-  int step;  // 1 + the substep, or 0
+  int step;  // 1 + the substep of the first error, or 0
   int outside, first_outside, not_finite, first_not_finite;
-  int full, wanted;  // 1 + the substep whose blocks had no room, or 0, and how many they were
+  int full, wanted;  // 1 + the first substep without room for its blocks, or 0; number of missing blocks
 };
 
-// The fields of the particles are those that `p2g` and `advance` read, and move in place. The activation is that of the
-// first substep.
+// The fields of the particles are those of `p2g` and `advance`, updated in place. The activation is that of the first
+// substep.
 template <class T, int D>
 struct ResidentArguments {
   P2GArguments<T, D> p2g;
@@ -30,18 +30,18 @@ struct ResidentArguments {
   bool obstacles = false;
   int scenes = 1;
   int64_t steps = 0;
-  double time = 0, dt = 0;       // of obstacles, where scenes have no time of their own
-  double* scene_time = nullptr;  // [scenes], goes on with each substep
+  double time = 0, dt = 0;       // of obstacles, for scenes without separate clocks
+  double* scene_time = nullptr;  // [scenes], advanced in each substep
   const T* scene_dt = nullptr;   // [scenes]
-  char* rows = nullptr;          // for scenes that shared memory does not hold, or not any more
-  char* blocks = nullptr;        // [spare_blocks], for those that reach more blocks
+  char* rows = nullptr;          // for scenes that exceed shared memory
+  char* blocks = nullptr;        // [spare_blocks], for scenes that grow beyond it
   int spare_blocks = 0;
-  int* blocks_taken = nullptr;      // of these, zero before the call
+  int* blocks_taken = nullptr;      // number used, zero before the call
   SceneTrouble* trouble = nullptr;  // [scenes]
 };
 
-// Tells what went wrong in the status of the activation.
-struct ResidentStatusArguments {
+// Writes the errors of the scenes to the status of the activation.
+struct BlockPerSceneStatusArguments {
   int scenes = 1, max_blocks = 0;
   int64_t steps = 0;
   const SceneTrouble* trouble = nullptr;

@@ -2,18 +2,18 @@
 
 #include "rollout/step_kernels.h"
 
-// The schedule of scenes that stay on a multiprocessor each, on CUDA.
+// The schedule with a thread block per scene, on CUDA.
 namespace mpm {
 
-// Takes n substeps of particles that move in place, after the activation of the first of them, which follows `after`
-// substeps of the call and begins at `time`.
+// Computes n substeps of particles in place, after the activation of the first one. `after` is the number of earlier
+// substeps of the call, `time` the time of the first one.
 template <class T, int D>
-void take_scenes(Substeps<T, D>& s, int64_t n, int64_t after, double time, const int* activated, int* status,
-                 backend::Stream stream) {
+void run_scenes(Substeps<T, D>& s, int64_t n, int64_t after, double time, const int* activated, int* status,
+                backend::Stream stream) {
   const SubstepsInputs& in = s.in;
   const int64_t P = in.x.size(0), rows = (P + 64 * in.scenes) * kMostResidentRow;
   const Tensor row_memory = empty(in.x, {rows}, ScalarType::Byte);
-  // A scene that grows takes new ones each time; all of them together, twice what they should want.
+  // A scene uses new spare blocks each time it grows; together, twice the expected number.
   const int64_t spare = std::min<int64_t>(2 * int64_t(s.activation.max_blocks), s.update.block_count);
   const Tensor block_memory = empty(in.x, {spare * kMostResidentBlock}, ScalarType::Byte);
   Tensor trouble = empty_int(in.x, {1 + in.scenes * int64_t(sizeof(SceneTrouble) / sizeof(int))});
@@ -28,10 +28,10 @@ void take_scenes(Substeps<T, D>& s, int64_t n, int64_t after, double time, const
   a.spare_blocks = int(spare);
   a.blocks_taken = first;
   a.trouble = reinterpret_cast<SceneTrouble*>(first + 1);
-  s.calls[0].law->template kernels<T, D>().resident(s.laws[0], a, stream);
-  backend::resident_status({int(in.scenes), s.activation.max_blocks, n, a.trouble, activated, status, s.activation.id,
-                            s.activation.id_stride},
-                           stream);
+  s.calls[0].law->template kernels<T, D>().block_per_scene(s.laws[0], a, stream);
+  backend::block_per_scene_status({int(in.scenes), s.activation.max_blocks, n, a.trouble, activated, status,
+                                   s.activation.id, s.activation.id_stride},
+                                  stream);
 }
 
 }  // namespace mpm

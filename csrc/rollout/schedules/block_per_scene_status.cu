@@ -4,13 +4,13 @@
 #include "grid/status.h"
 #include "rollout/kernels.h"
 
-// The status after a call of resident scenes, as activations of all its substeps would have left it.
+// The status after a call, equal to that after activations of all its substeps.
 namespace mpm::cuda {
 namespace {
 
 constexpr int kThreads = 256;
 
-__device__ void write_trouble(const ResidentStatusArguments& a, const SceneTrouble& t, int row, int before) {
+__device__ void write_errors(const BlockPerSceneStatusArguments& a, const SceneTrouble& t, int row, int before) {
   int* const status = a.status + row * int64_t(kStatusSize);
   status[kProblemActivation] = before + t.step - 1;
   const auto write = [&](int particles, int p, int count, int first, int id) {
@@ -23,8 +23,8 @@ __device__ void write_trouble(const ResidentStatusArguments& a, const SceneTroub
   write(t.not_finite, t.first_not_finite, kNonFiniteCount, kNonFiniteFirst, kNonFiniteId);
 }
 
-// By one thread: row 0 tells of the first activation with trouble in any scene.
-__device__ void tell_of_all(const ResidentStatusArguments& a, int before) {
+// By one thread: row 0 reports the first activation with an error in any scene.
+__device__ void tell_of_all(const BlockPerSceneStatusArguments& a, int before) {
   SceneTrouble all{INT_MAX, 0, INT_MAX, 0, INT_MAX, INT_MAX, 0};
   for (int b = 0; b < a.scenes; b++) {
     const SceneTrouble& t = a.trouble[b];
@@ -36,21 +36,21 @@ __device__ void tell_of_all(const ResidentStatusArguments& a, int before) {
     if (t.not_finite > 0)
       all.not_finite += t.not_finite, all.first_not_finite = ::min(all.first_not_finite, t.first_not_finite);
   }
-  if (a.status[kProblemActivation] < 0 && all.step < INT_MAX) write_trouble(a, all, 0, before);
+  if (a.status[kProblemActivation] < 0 && all.step < INT_MAX) write_errors(a, all, 0, before);
   if (all.wanted == 0) return;
   const int full = before + all.full - 1;
   if (a.status[kProblemActivation] < 0 || full < a.status[kProblemActivation]) a.status[kProblemActivation] = full;
   a.status[kBlocksWanted] = ::max(a.status[kBlocksWanted], a.max_blocks + all.wanted);
 }
 
-__global__ void __launch_bounds__(kThreads) resident_status_kernel(const ResidentStatusArguments a) {
+__global__ void __launch_bounds__(kThreads) block_per_scene_status_kernel(const BlockPerSceneStatusArguments a) {
   const int before = a.activated[kActivations] - 1;
   for (int64_t row = threadIdx.x; row <= a.scenes; row += kThreads) {
     const int64_t start = row * kStatusSize;
     copy_status(a.activated + start, a.status + start);
     if (row == 0) continue;
     const SceneTrouble& t = a.trouble[row - 1];
-    if (t.step > 0 && a.status[start + kProblemActivation] < 0) write_trouble(a, t, int(row), before);
+    if (t.step > 0 && a.status[start + kProblemActivation] < 0) write_errors(a, t, int(row), before);
   }
   __syncthreads();
   if (threadIdx.x > 0) return;
@@ -60,8 +60,8 @@ __global__ void __launch_bounds__(kThreads) resident_status_kernel(const Residen
 
 }  // namespace
 
-void resident_status(const ResidentStatusArguments& a, Stream stream) {
-  launch(resident_status_kernel, 1, kThreads, 0, stream, a);
+void block_per_scene_status(const BlockPerSceneStatusArguments& a, Stream stream) {
+  launch(block_per_scene_status_kernel, 1, kThreads, 0, stream, a);
 }
 
 }  // namespace mpm::cuda

@@ -6,15 +6,15 @@
 #include "transfer/advance_gather.cuh"
 #include "transfer/scatter.cuh"
 
-// The kernel of G2P2G: a thread block takes the particles of an item, as P2G does. Their velocities come from a tile
-// that goes a node further than they could when they were activated, so that those that have left their block since are
-// mostly still in it.
+// The kernel of G2P2G: a thread block processes the particles of an item, as in P2G. Their velocities come from a tile
+// that reaches one node further than the nodes of the block, so it still serves most particles that have left the block
+// since the activation.
 namespace mpm::cuda {
 
 constexpr int kHalo = 1;
 
 // The nodes of a tile: those of the base block, the next Order along each axis, and kHalo more on either side. Rows are
-// apart so that neighbours along any axis, and most nodes of a cube of 4, lie in different banks.
+// padded so that neighbours along any axis, and most nodes of a cube of 4, lie in different banks.
 template <int Order, class T, int D>
 struct WideTile {
   static constexpr int width = kBlockWidth + Order + 2 * kHalo, row = width + 2, plane = width * row + 4;
@@ -33,34 +33,34 @@ struct WideTile {
   }
 };
 
-// An item and where it is: its block and those around it.
+// An item with its block and the blocks around it.
 template <class T, int D>
 struct ItemPlace {
   static constexpr int around = D == 2 ? 9 : 27;
   int begin, end;         // its particles
   int slots[around];      // of the blocks around, -1 where they are not active
-  int following[1 << D];  // of those that P2G reaches
+  int following[1 << D];  // slots of the blocks that P2G reaches
   BaseBlock<T, D> home;
 };
 
-// Of the item at hand, and of the next one. Once its particles have moved the tile is that of the next one.
+// Data of the current and the next item. After the particles have moved, the tile is that of the next item.
 template <class S>
 struct G2P2GMemory {
   static constexpr int D = S::D;
   using T = typename S::T;
   using Tile = WideTile<S::Order, T, D>;
   alignas(16) Item next;
-  int number;  // of the one after that
+  int number;  // of the item after the next
   ItemPlace<T, D> places[2];
   int head[S::lists + 1];
-  Strays<S::batch> far;                    // particles that have gone further than the blocks around, after G2P
-  int strays;                              // particles in these:
-  uint16_t row[S::batch], base[S::batch];  // of what they give, and of their base nodes, from the first block around
+  Strays<S::batch> far;                    // particles beyond the blocks around, after G2P
+  int strays;                              // number of particles in the blocks around:
+  uint16_t row[S::batch], base[S::batch];  // their contributions; their base nodes, from the first block around
   T x[D][S::batch];
   alignas(16) typename Tile::Node tile[Tile::room];
 };
 
-// Node sums in fixed point have kernels of their own: what these do once for each node costs the others 7%.
+// Node sums in fixed point have separate kernels, since their work per node would cost the others 7%.
 template <bool Fixed, class Source, class Task>
 class G2P2G {
  public:
@@ -82,8 +82,8 @@ class G2P2G {
         dt_(source.fields.time_step(0)),
         parameters_(source.parameters(0)) {}
 
-  // Items until there are none left, by all threads. While the particles of one are moved the blocks around the next
-  // one are looked up, and while they are added up its tile is on its way.
+  // Processes items until there are none left, by all threads. The blocks around the next item are looked up while the
+  // particles of the current one move, and its tile is loaded while they are added to the nodes.
   __device__ void take_items(const Schedule<const int>& schedule) {
     const int count = *schedule.item_count;
     if (int(blockIdx.x) >= count) return;
@@ -115,7 +115,7 @@ class G2P2G {
     }
   }
 
-  // Particles that are left out are at rest.
+  // Skipped particles are at rest.
   __device__ void leave_out(int p) const { source.leave_out_at_rest(p); }
 
   __device__ void tell(Drift* drift) const { add_to_drift(drift, strays_, lost_); }
@@ -147,7 +147,7 @@ class G2P2G {
     __pipeline_commit();
   }
 
-  // The place of the next item. All blocks around it should be active where the domain has them. By the last threads,
+  // Finds the place of the next item. All blocks around it within the domain should be active. By the last threads,
   // which mostly have fewer particles to move.
   __device__ void find(ItemPlace<T, D>& place) {
     const int thread = int(threadIdx.x) - (threads - 64);
@@ -178,10 +178,10 @@ class G2P2G {
     }
   }
 
-  // The positions and the tile, on their way from memory, which __pipeline_wait_prior() waits for.
+  // Begins to load the positions and the tile; __pipeline_wait_prior() waits for them.
   __device__ void load(const ItemPlace<T, D>& place) {
     int thread = threadIdx.x;
-    asm volatile("" : "+r"(thread));  // or all addresses would be kept from item to item, in local memory
+    asm volatile("" : "+r"(thread));  // otherwise all addresses would be kept in local memory between items
     const int n = place.end - place.begin, first = first_row_ + place.begin;
 #pragma unroll 1
     for (int k = thread; k < n; k += threads)
@@ -212,7 +212,7 @@ class G2P2G {
     __pipeline_commit();
   }
 
-  // What a particle at x gets from the nodes.
+  // Sums of G2P for a particle at x.
   __device__ typename Task::Result gather(const Vector<T, D>& x) const {
     const Geometry<T, D>& g = topology().geometry;
     bool in_tile = true;
@@ -242,7 +242,7 @@ class G2P2G {
     for (int k = threadIdx.x; k < n; k += threads) move(k, first + k);
   }
 
-  // Particle k of the item, in row p, where it was.
+  // Moves particle k of the item, in row p, in place.
   __device__ void move(int k, int p) {
     Vector<T, D> x;
 #pragma unroll
@@ -268,7 +268,7 @@ class G2P2G {
     if (!at_home) stray(k, row, to);
   }
 
-  // A particle that is not in its block any more. It may go less than a cell before it is looked at again.
+  // A particle out of its block. It may move less than a cell before it is inspected again.
   __device__ void stray(int k, int row, const Vector<T, D>& x) {
     strays_++;
     const Geometry<T, D>& g = topology().geometry;
@@ -294,7 +294,7 @@ class G2P2G {
     }
   }
 
-  // A warp takes one at a time.
+  // A warp adds one at a time.
   __device__ void add_all_strays() const {
     for (int s = threadIdx.x / 32; s < m.strays; s += threads / 32) {
       const int base = m.base[s];
@@ -323,7 +323,7 @@ __global__ void __launch_bounds__(Source::Shape::threads, kG2P2GBlocks)
                  const int* copy, int* taken) {
   wait_for_kernel_before();
   const Topology<T, D>& t = source.topology;
-  if (own.is_due(t.particles)) return;  // and there is a new activation between G2P and P2G
+  if (own.is_due(t.particles)) return;  // a new activation follows between G2P and P2G
   extern __shared__ __align__(16) char memory[];
   __shared__ G2P2GMemory<typename Source::Shape> shared;
   G2P2G<Fixed, Source, Task> g2p2g(source, task, shared, memory, *copy ? own.rows : 0, taken);

@@ -7,19 +7,19 @@
 // A call of many substeps on CUDA that owns its particles: G2P and the next P2G are one kernel while an activation
 // lasts. Between substeps
 //   G2P          of the substep before,     \
-//   activation,                              |  where particles have moved too far for that,
+//   activation,                              |  if particles have moved too far for that,
 //   P2G          into the order of items;   /
-//   G2P2G        where not.
-// All four are launched, and the device finds which of them have something to do.
+//   G2P2G        otherwise.
+// All four are launched, and each checks on the device whether it has work.
 namespace mpm {
 
 template <class T, int D>
-class Merged {
+class FusedG2P2G {
  public:
-  // Of `s`, which merges; `results` get the particles in their given order, status[0] the last status.
-  Merged(Substeps<T, D>& s, const Particles<T>& results, Tensor status[2], backend::Stream stream);
+  // `s` has the kernels of a step; `results` receive the particles in their given order, status[0] the last status.
+  FusedG2P2G(Substeps<T, D>& s, const Particles<T>& results, Tensor status[2], backend::Stream stream);
 
-  void take_all(const Particles<const T>& given, const int* before);
+  void run(const Particles<const T>& given, const int* before);
 
  private:
   Substeps<T, D>& s_;
@@ -30,20 +30,20 @@ class Merged {
   Tensor x_, F_, J_, residual_, history_, mass_, volume_, origin_, copy_, items_taken_, nowhere_;
   Particles<T> own_;
 
-  int* status(int64_t step) { return status_[(s_.in.n - 1 - step) % 2]; }  // the last one is the first of the two
+  int* status(int64_t step) { return status_[(s_.in.n - 1 - step) % 2]; }  // that of the last step is status_[0]
   Drift* drift(int64_t step) { return static_cast<Drift*>(s_.drifts.data_ptr()) + step % 2; }
   Drift* nowhere() { return static_cast<Drift*>(nowhere_.data_ptr()); }
   auto& kernels() { return s_.calls[0].law->template kernels<T, D>(); }
 
   void begin(const Particles<const T>& given, const int* before);
   void use_own();
-  void go_on(int64_t step, bool ends, backend::Stream stream);
+  void run_substep(int64_t step, bool ends, backend::Stream stream);
   void update_grid(int64_t step, backend::Stream stream);
   void end();
 };
 
 template <class T, int D>
-Merged<T, D>::Merged(Substeps<T, D>& s, const Particles<T>& results, Tensor status[2], backend::Stream stream)
+FusedG2P2G<T, D>::FusedG2P2G(Substeps<T, D>& s, const Particles<T>& results, Tensor status[2], backend::Stream stream)
     : s_(s),
       results_(results),
       status_{static_cast<int*>(status[0].data_ptr()), static_cast<int*>(status[1].data_ptr())},
@@ -68,24 +68,24 @@ Merged<T, D>::Merged(Substeps<T, D>& s, const Particles<T>& results, Tensor stat
 }
 
 template <class T, int D>
-void Merged<T, D>::take_all(const Particles<const T>& given, const int* before) {
+void FusedG2P2G<T, D>::run(const Particles<const T>& given, const int* before) {
   begin(given, before);
   use_own();
   const int64_t last = s_.in.n - 1;
   int64_t step = 1;
-  go_on(step++, false, stream_);
-  const auto two = [&](backend::Stream on) { go_on(step, false, on), go_on(step + 1, false, on); };
+  run_substep(step++, false, stream_);
+  const auto two = [&](backend::Stream on) { run_substep(step, false, on), run_substep(step + 1, false, on); };
   step += 2 * replay((last - step) / 2, stream_, two, [&] { after_substeps(rows_, 2, stream_); });
   for (; step <= last; step++) {
-    go_on(step, step == last, stream_);
+    run_substep(step, step == last, stream_);
     after_substeps(rows_, 1, stream_);
   }
   end();
 }
 
-// The first substep but for its G2P, from given tensors.
+// The first substep without its G2P, from given tensors.
 template <class T, int D>
-void Merged<T, D>::begin(const Particles<const T>& given, const int* before) {
+void FusedG2P2G<T, D>::begin(const Particles<const T>& given, const int* before) {
   s_.read(given, own_.F);
   s_.write(own_);
   s_.move_late(own_, false, false);
@@ -107,9 +107,9 @@ void Merged<T, D>::begin(const Particles<const T>& given, const int* before) {
   update_grid(0, stream_);
 }
 
-// What the kernels read and write from the second substep on.
+// Sets the fields that the kernels read and write from the second substep on.
 template <class T, int D>
-void Merged<T, D>::use_own() {
+void FusedG2P2G<T, D>::use_own() {
   const Particles<const T> own = constant(own_);
   s_.read(own, own_.F);
   s_.move_late(own_, true, false);
@@ -121,18 +121,18 @@ void Merged<T, D>::use_own() {
   activation.origin = s_.settling.origin;
   activation.copy = s_.settling.copy;
   activation.copy_rows = rows_;
-  GivingBack<T>& giving = s_.advance.own;
-  giving.rows = rows_;
-  giving.origin = s_.settling.origin;
-  giving.columns = int(s_.columns);
-  giving.history = own.history;
-  giving.history_next = results_.history;
+  GivingBack<T>& restore = s_.advance.own;
+  restore.rows = rows_;
+  restore.origin = s_.settling.origin;
+  restore.columns = int(s_.columns);
+  restore.history = own.history;
+  restore.history_next = results_.history;
 }
 
-// From the grid of the step before to that of this one, the last of which has a new activation, so that the status
-// tells how many blocks there are by then.
+// From the grid of the previous step to that of this one. The last step has a new activation, whose status counts the
+// blocks at the end.
 template <class T, int D>
-void Merged<T, D>::go_on(int64_t step, bool ends, backend::Stream stream) {
+void FusedG2P2G<T, D>::run_substep(int64_t step, bool ends, backend::Stream stream) {
   const Drift* const before = drift(step - 1);
   s_.advance.own.drift = s_.settling.drift = s_.activation.drift = ends ? nullptr : before;
   s_.activation.missed = before;
@@ -150,7 +150,7 @@ void Merged<T, D>::go_on(int64_t step, bool ends, backend::Stream stream) {
 }
 
 template <class T, int D>
-void Merged<T, D>::update_grid(int64_t step, backend::Stream stream) {
+void FusedG2P2G<T, D>::update_grid(int64_t step, backend::Stream stream) {
   s_.next.drift = s_.next.watched = drift(step);
   s_.next.next_drift = drift(step + 1);
   s_.next.items_taken = static_cast<int*>(items_taken_.data_ptr());
@@ -160,7 +160,7 @@ void Merged<T, D>::update_grid(int64_t step, backend::Stream stream) {
 
 // G2P of the last substep, into the results.
 template <class T, int D>
-void Merged<T, D>::end() {
+void FusedG2P2G<T, D>::end() {
   G2PAdvanceArguments<T, D> a = s_.advance;
   a.late = false;
   a.own.drift = nullptr;

@@ -4,7 +4,7 @@
 
 #include "cpu/cell_sort.h"
 #include "rollout/copies.cpu.h"
-#include "rollout/slack.cpu.h"
+#include "rollout/displacement_budget.cpu.h"
 #include "transfer/advance_chunk.cpu.h"
 #include "transfer/lines.cpu.h"
 #include "transfer/own_nodes.cpu.h"
@@ -13,18 +13,18 @@ namespace mpm::cpu {
 inline namespace TORCH_MPM_ISA {
 namespace {
 
-// Quadratic splines: the nodes of particles that are up to one cell outside of two base blocks of one colour never
-// overlap, and what is summed in turn of the colours has an order.
+// Quadratic splines: the nodes of particles up to one cell outside of their base blocks never overlap for two blocks of
+// one colour, and sums over the colours in turn have an order.
 constexpr int kOrder = 2;
 
-// Cells of an axis where the particles of a base block may be.
+// Number of cells along an axis in which the particles of a base block may be.
 constexpr int kNear = kBlockWidth + 2;
 
-// Up to kLanes particles of one cell, by their numbers in the chunk, which ascend.
+// Up to kLanes particles of one cell, by ascending numbers in the chunk.
 struct GroupOfChunk {
   int first, count;
   bool loads_run, stores_run, whole;
-  Group group;  // where they do not follow each other
+  Group group;  // if they are not consecutive
 
   MPM_HD GroupOfChunk(const uint16_t* order, int rest, int particles)
       : first(order[0] % kChunk), count(rest < kLanes ? rest : kLanes) {
@@ -59,7 +59,7 @@ struct GroupOfChunk {
 #endif
 };
 
-// What a thread does to the chunks of its base blocks.
+// The work of a thread on the chunks of its base blocks.
 template <bool Gradient, class T, int D>
 class ChunkPass {
  public:
@@ -70,7 +70,7 @@ class ChunkPass {
         rows_(a.advance),
         mass_(a.to_nodes.p2g.mass),
         volume_(a.to_nodes.p2g.volume),
-        slack_(t_.geometry, a.follows ? a.to_nodes.whereabouts : nullptr),
+        displacement_budget_(t_.geometry, a.follows ? a.to_nodes.whereabouts : nullptr),
         copies_(a.to_nodes, copies) {
     lay_out<D>(written_, a.to_nodes.schedule, t_.max_blocks, t_.particles);
   }
@@ -78,11 +78,11 @@ class ChunkPass {
     if (a_.follows) __atomic_fetch_add(&a_.to_nodes.whereabouts->strays, strays_, __ATOMIC_RELAXED);
   }
 
-  // `my_turn` waits until sums of other blocks that come first are done.
+  // `my_turn` waits for the sums of earlier colours.
   template <class F>
-  void take(int64_t b, const F& my_turn) {
+  void process(int64_t b, const F& my_turn) {
     const BaseBlock<T, D> base_block(t_, schedule_.base_slot[b]);
-    slack_.begin(base_block);
+    displacement_budget_.begin(base_block);
     velocities_.load_from(a_.advance.gather.nodes, base_block, 0, D);
     lines_.load_from(velocities_);
     if (a_.follows) momenta_.clear();
@@ -115,7 +115,7 @@ class ChunkPass {
   using P = Pack<T, N>;
   using R = ChunkRows<D>;
 
-  // f(number in the chunk, pack of particles from there on) for all of them.
+  // Calls f(number in the chunk, pack of particles from there on) for all packs.
   template <class F>
   MPM_HD void for_packs(const F& f) const {
     int i = 0;
@@ -123,7 +123,7 @@ class ChunkPass {
     if (i < count_) f(i, PartOf<N>{begin_ + i, count_ - i});
   }
 
-  // Distances of particles i, i + 1, ... from their base nodes, and their cells, see below.
+  // Distances of particles i, i + 1, ... from their base nodes, and their entries of cell_ and near_.
   MPM_HD void find_cells(int i, const BaseBlock<T, D>& base_block, const P x[D], P f[D]) {
     Mask<T, N> inside;
     P cell, near;
@@ -157,7 +157,7 @@ class ChunkPass {
 
   // Sums of G2P for the particles that are in their base block.
   void gather(const BaseBlock<T, D>& base_block, const Chunk& next) {
-    int expected = 0;
+    int prefetched = 0;
     for (int cell = 0, i = 0; cell < kBlockNodes<D>; cell++) {
       int base[D];
       for (int a = 0; a < D; a++) base[a] = cell_coordinate<D>(cell, a);
@@ -168,23 +168,23 @@ class ChunkPass {
           f[a] = distance_in_cells(t_.geometry, a, g.load(rows_.x_next.row[a] + begin_),
                                    Lanes<T>(T(base_block.corner[a] + base[a])));
         const T* at = lines_.value + lines_.at(base);
-        // Most cells have one group: what the compiler keeps of the nodes for a second one goes to the stack and back.
+        // Most cells have one group: otherwise the compiler would store nodes for a second one on the stack.
         asm volatile("" : "+r"(at));
         Sums<Lanes<T>, D> s[D];
         gather_lines<Gradient, T, D>(f, at, s);
         g.put(motion_, s);
-        for (; expected <= i; expected += 64 / int(sizeof(T))) expect(next, expected);
+        for (; prefetched <= i; prefetched += 64 / int(sizeof(T))) prefetch(next, prefetched);
       }
       i = cell_end_[cell];
     }
   }
 
-  // Asks for the cache lines of the i-th particle of the chunk that comes next. (GCC leaves out calls of functions that
-  // do no more.)
-  MPM_HD void expect(const Chunk& next, int i) const {
+  // Prefetches the cache lines of the i-th particle of the next chunk. (GCC removes calls of functions that only
+  // prefetch, unless they are inlined.)
+  MPM_HD void prefetch(const Chunk& next, int i) const {
     if (i >= next.count) return;
     const int64_t p = next.id - t_.index + i;
-    for (int k = 0; k < a_.to_nodes.expected_count; k++) __builtin_prefetch(a_.to_nodes.expected[k] + p, 0, 2);
+    for (int k = 0; k < a_.to_nodes.prefetched_count; k++) __builtin_prefetch(a_.to_nodes.prefetched[k] + p, 0, 2);
   }
 
   void gather_stray(int scene, int i) {
@@ -208,7 +208,7 @@ class ChunkPass {
     motion_.put_by([&](const T& v, T* row) { row[i] = v; }, s);
   }
 
-  // By what `find_cells` has found: its weights are of these nodes, however another program might round.
+  // By the cell of `find_cells`: its weights belong to these nodes, independent of rounding elsewhere.
   void add_stray(const BaseBlock<T, D>& base_block, int i) {
     int base[D];
     for (int a = D - 1, near = near_[i]; a >= 0; a--, near /= kNear) base[a] = base_block.corner[a] + near % kNear - 1;
@@ -217,7 +217,7 @@ class ChunkPass {
     strays_++;
   }
 
-  // The end of the step.
+  // The end of the step: x, F and J.
   void advance(int scene) {
     const P scale(a_.advance.gather.moment_scale * double(t_.geometry.dx)), inverse_dx(t_.geometry.inverse_dx);
     const P dt(time_step(a_.advance.scene_dt, a_.advance.dt, scene));
@@ -234,7 +234,7 @@ class ChunkPass {
     });
   }
 
-  // Laws, and what the particles give to the nodes.
+  // Laws, and contributions of the particles to the nodes.
   void give(const BaseBlock<T, D>& base_block) {
     const P2GArguments<T, D>& p2g = a_.to_nodes.p2g;
     copies_.fetch_run(begin_, count_, motion_.affine[0][0], motion_.kLine);
@@ -254,7 +254,7 @@ class ChunkPass {
       }
       p.stress = load_matrix_or_zero<T, D>(copies_.field(R::stress), RunOf<N>{i});
       find_cells(i, base_block, x, f);
-      slack_.add(x, count_ - i);
+      displacement_budget_.add(x, count_ - i);
       contributions_.put(i, f, momentum_contribution<kOrder, true, Gradient>(t_.geometry, p, f));
     });
     copies_.leave();
@@ -265,12 +265,12 @@ class ChunkPass {
   const ScheduleIn schedule_;
   const AdvancedRows<T, D> rows_;
   const FieldRows<const T, 1> mass_, volume_;
-  Slack<T, D> slack_;
+  DisplacementBudget<T, D> displacement_budget_;
   int strays_ = 0, begin_ = 0, count_ = 0;
   ScheduleOut written_;  // its orders and cells, chunk by chunk
   uint16_t *order_ = nullptr, *cell_end_ = nullptr;
-  // Of the particles of the chunk their cell in the base block, kBlockNodes if it is in another one; and their cell
-  // among those where they may be.
+  // For each particle of the chunk: its cell in the base block, kBlockNodes if it is in another block; and its cell
+  // among the kNear^D cells around.
   uint8_t cell_[kChunk + N], near_[kChunk + N];
   Copies<T, D> copies_;
   Motion<Gradient, T, D> motion_;
@@ -291,7 +291,7 @@ void g2p2g_with(const G2P2GChunksArguments<T, D>& a) {
     int colour = 0;
     for (int64_t b; (b = next()) >= 0;) {
       while (b >= s.colour_start[colour + 1]) colour++;
-      pass.take(b, [&] { colours.wait_before(colour); });
+      pass.process(b, [&] { colours.wait_before(colour); });
       colours.finish(colour);
     }
   });
@@ -327,7 +327,7 @@ void longest_move(const LongestMoveArguments<T, D>& a) {
         for (int k = 0; k < kGroup; k++) {
           const T way = dt * from[k], move = way < 0 ? -way : way;
           most[k] = move > most[k] ? move : most[k];
-          nan[k] += way - way;  // NaN if it is not finite
+          nan[k] += way - way;  // NaN if the velocity is not finite
         }
       }
     }
@@ -337,7 +337,7 @@ void longest_move(const LongestMoveArguments<T, D>& a) {
         longest = most[k] > longest ? most[k] : longest;
         if (nan[k] != T(0)) longest = T(__builtin_inf());
       }
-    // Numbers that are not negative are in the order of their bits.
+    // Numbers that are not negative have the order of their bits.
     Bits* const all = reinterpret_cast<Bits*>(a.longest);
     const Bits own = __builtin_bit_cast(Bits, longest);
     Bits now = __atomic_load_n(all, __ATOMIC_RELAXED);

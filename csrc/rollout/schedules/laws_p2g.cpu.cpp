@@ -1,14 +1,14 @@
 #include "rollout/laws_p2g.h"
 
 #include "rollout/copies.cpu.h"
-#include "rollout/slack.cpu.h"
+#include "rollout/displacement_budget.cpu.h"
 #include "transfer/scatter.cpu.h"
 
 namespace mpm::cpu {
 inline namespace TORCH_MPM_ISA {
 namespace {
 
-// What P2G reads of the particles beside their stress, by rows.
+// The rows of the particles that P2G reads, without their stress.
 template <class T, int D>
 struct GivenRows {
   FieldRows<const T, D> x, v;
@@ -32,7 +32,7 @@ struct GivenRows {
   }
 };
 
-// The order of a chunk whose particles are in the order of cells.
+// The order of a chunk whose particles are sorted by cell.
 template <int D>
 void write_order(const uint16_t* cell_end, uint16_t order[kCopyLine]) {
   for (int cell = 0, i = 0; cell < kBlockNodes<D>; cell++)
@@ -54,9 +54,10 @@ void laws_p2g_with(const LawsP2GArguments<T, D>& a) {
   int taken = 0;
   const auto memory = [&] { return a.copies + a.copy_size * __atomic_fetch_add(&taken, 1, __ATOMIC_RELAXED); };
   scatter_chunks<Order, true, Gradient>(t, a.p2g.nodes, 0, 1 + D, [&] {
-    return [&, copies = Copies<T, D>(a, memory()), slack = Slack<T, D>(t.geometry, a.whereabouts)](
+    return [&, copies = Copies<T, D>(a, memory()),
+            displacement_budget = DisplacementBudget<T, D>(t.geometry, a.whereabouts)](
                const BaseBlock<T, D>& base_block, int64_t c, auto& contributions, auto& tile) mutable {
-      slack.begin(base_block);
+      displacement_budget.begin(base_block);
       constexpr int N = kWideLanes<T>;
       const Chunk chunk(t, s, c), next(t, s, c + 1 < chunks ? c + 1 : c);
       const auto place = [&](const Chunk& k) { return int(k.id - t.index); };
@@ -79,8 +80,8 @@ void laws_p2g_with(const LawsP2GArguments<T, D>& a) {
         p.stress = load_matrix_or_zero<T, D>(copies.field(R::stress), RunOf<N>{i});
         distances(t, base_block, entries_of<N>(order + i, N), x, f);
         contributions.put(i, f, momentum_contribution<Order, true, Gradient>(t.geometry, p, f));
-        if (a.whereabouts) slack.add(x, rest);
-        copies.expect(i);
+        if (a.whereabouts) displacement_budget.add(x, rest);
+        copies.prefetch(i);
       }
       copies.leave();
       if (a.rearranges) {

@@ -5,18 +5,17 @@
 #include "rollout/replay.h"
 #include "rollout/step_kernels.h"
 
-// The schedule of few particles whose thread blocks all run at once, on CUDA.
+// The schedule of few particles with thread blocks that all run at once, on CUDA.
 namespace mpm {
 
 // Whether a device has refused CUDA graphs with loops.
 inline std::atomic<bool> loops_are_refused = CUDART_VERSION < 13000;
 
 #if CUDART_VERSION >= 13000
-// Substeps from the second on until the last alone is left, of particles that move in place. The status of the first is
-// in `status`, and is that of all of them in the end. False where the device takes no such graph: none, where processes
-// share it by MPS.
+// Computes the substeps from the second to the last but one, in place. `status` has the status of the first one, and at
+// the end that of all of them. False if the device does not support graphs with loops, as under MPS.
 template <class T, int D>
-bool take_persistent(Substeps<T, D>& s, int* activated, int* status, backend::Stream stream) {
+bool run_persistent(Substeps<T, D>& s, int* activated, int* status, backend::Stream stream) {
   const SubstepsInputs& in = s.in;
   PersistentArguments<T, D> a{{s.update, s.contact, s.obstacles, s.activation.max_blocks}, s.p2g, s.late, s.advance};
   const int64_t rows = s.pool.nodes.size(0);
@@ -41,7 +40,7 @@ bool take_persistent(Substeps<T, D>& s, int* activated, int* status, backend::St
   s.activation.drift = a.drift;
   s.activation.previous_status = status;
   s.activation.status = activated;
-  static std::atomic<int> works_on = -1;  // a device that has taken one
+  static std::atomic<int> works_on = -1;  // device on which such a graph has run
   int device = 0;
   cudaGetDevice(&device);
   const auto launch = [&](cudaStream_t on, unsigned long long condition) {
@@ -51,7 +50,7 @@ bool take_persistent(Substeps<T, D>& s, int* activated, int* status, backend::St
     s.calls[0].law->template kernels<T, D>().persistent(s.laws[0], a, on);
   };
   try {
-    if (works_on == device) launch(stream, 0);  // so that the device is at work while the host makes the graph
+    if (works_on == device) launch(stream, 0);  // so that the device works while the host makes the graph
     repeat(stream, launch, [&] { return on_host(a.steps_so_far, 1, stream)[0] < a.steps; });
     works_on = device;
   } catch (const std::exception&) {

@@ -6,12 +6,11 @@
 #include "cpu/schedule.h"
 #include "rollout/step_kernels.h"
 
-// The particles of a call on the CPU. They move in place, and now and then change places in memory, so that they lie in
-// the order of their cells: packs of particles are loads and stores of whole registers then. At the end they are given
-// back in the order in which they came.
+// The particles of a call on the CPU. They move in place and are reordered by cell from time to time, so that packs of
+// particles are loads and stores of whole registers. At the end they are restored to the given order.
 namespace mpm {
 
-// A field of the particles, [P, ...]: where it was given, or in one of two buffers.
+// A field of the particles, [P, ...]: the given tensor, or one of two buffers.
 template <class E>
 class OwnField {
  public:
@@ -24,7 +23,7 @@ class OwnField {
   const Field<const E>& now() const { return now_; }
   const Tensor& tensor() const { return buffers_[turn_]; }
 
-  // Where it is written: in the other buffer, or else in place if it is in one.
+  // Destination of writes: the other buffer, or the current one.
   Field<E> next(bool elsewhere) {
     Tensor& to = buffers_[other(elsewhere)];
     if constexpr (std::is_same_v<E, int>) {
@@ -40,7 +39,7 @@ class OwnField {
     now_ = field<const E>(buffers_[turn_]);
   }
 
-  // Adds its components, which are written where `next` says, or stay.
+  // Adds its components to a list, with the destination `next(elsewhere)` if they are written.
   void rows(std::vector<ParticleRow<E>>& list, int first, bool written, bool elsewhere) {
     const Field<E> to = written ? next(elsewhere) : Field<E>{};
     const int64_t m = shape_.size() > 1 ? shape_[1] : 1, n = shape_.size() > 2 ? shape_[2] : 1;
@@ -63,44 +62,44 @@ class OwnField {
 };
 
 template <class T, int D>
-class OwnParticles {
+class SortedCpu {
  public:
   OwnField<T> x, v, C, F, J, residual, history;
 
   // `sorts`: whether steps may change the order of the particles.
-  OwnParticles(Substeps<T, D>& steps, const Tensor& packed_history, bool sorts, backend::Stream stream);
+  SortedCpu(Substeps<T, D>& steps, const Tensor& packed_history, bool sorts, backend::Stream stream);
 
-  // Whether an activation may serve several substeps of a call. Where it does, G2P and the next P2G are one pass. Not
-  // of deterministic grids: how long it lasts depends on all scenes, and on it how the sums of each are rounded. Nor
-  // where gradients go through a pool that does not grow: they need room for the blocks of every substep. Nor with
-  // FLIP, whose velocities before the forces are those of particles that a pass has not left in memory.
+  // Whether an activation may serve several substeps of a call, with G2P and the next P2G in one pass. Exceptions:
+  // - deterministic grids: the length of an activation depends on all scenes, and affects the rounding of each;
+  // - gradients through a pool that does not grow, since they need room for the blocks of every substep;
+  // - FLIP, which needs the velocities of particles before the forces, and a pass does not store them.
   static bool may_last(const SubstepsInputs& in) {
     return in.lattice.order() == 2 && in.n > kLeastLastingSteps && !in.lattice.deterministic() &&
            (in.grows || in.resident) && in.flip == 0;
   }
 
-  // One substep, of which so many follow; false as `Substeps::activate`.
+  // One substep, with `following` further ones; false as for `Substeps::activate`.
   bool step(const int* status_before, int* status, int64_t following);
 
-  // Takes them to the order in which they came.
-  void give_back();
+  // Restores the given order.
+  void restore_order();
 
  private:
   using R = ChunkRows<D>;
 
-  // Particles change places once for the first few substeps to gain from it, and come back in the end.
+  // A reorder and the restoration at the end pay from this number of substeps on.
   static constexpr int64_t kLeastLastingSteps = 8;
-  static constexpr int64_t kLeastPasses = 2;  // that follow, where some may be a pass
-  // Strays, added up over the substeps, that cost what an activation does, for each of so many particles.
+  static constexpr int64_t kLeastPasses = 2;  // further substeps needed for a pass
+  // Cost of a particle out of its block, as a multiple of that of activating one particle.
   static constexpr int kStraysOfRenewal = 10;
-  static constexpr int kActivationsOfPatience = 16;  // after one that served a single substep
-  static constexpr int kDeterministicSteps = 8;      // after which particles change places on deterministic grids
+  static constexpr int kActivationsOfPatience = 16;  // after an activation that served a single substep
+  static constexpr int kDeterministicSteps = 8;      // between two reorders on deterministic grids
 
   double farthest() const;
   void find_laws();
   void keep_velocities();
   bool begin(const int* status_before, int* status, int64_t following);
-  void go_on(const int* status_before, int* status);
+  void run_substep(const int* status_before, int* status);
   bool pays(int64_t following);
   bool tries_to_last(int64_t following);
   bool lasts(int64_t following);
@@ -110,11 +109,11 @@ class OwnParticles {
   void set_advance();
   void pass(bool follows);
   void find_rows(bool rearranges);
-  void find_expected(bool motion);
+  void find_prefetched(bool motion);
   void advance();
 
-  // Calls visit(field, first row of the copy or -1, whether laws read it, whether they change it) for what changes
-  // places together.
+  // Calls visit(field, first row of the copy or -1, whether laws read it, whether they change it) for the fields that
+  // are reordered together.
   template <class Visit>
   void for_fields(const Visit& visit) {
     const bool gradient = has(in_.F), ratio = has(in_.J);
@@ -135,28 +134,27 @@ class OwnParticles {
   backend::Stream stream_;
   OwnField<T> mass_, volume_;
   OwnField<T> kept_;                     // of FLIP
-  std::vector<OwnField<T>> parameters_;  // that particles have
+  std::vector<OwnField<T>> parameters_;  // per particle
   OwnField<int> scene_, material_, origin_;
   std::vector<ChunkLaw<T, D>> laws_;
   std::vector<ParticleRow<T>> rows_;
   std::vector<ParticleRow<int>> numbers_;
-  std::vector<const T*> expected_;
+  std::vector<const T*> prefetched_;
   LawsP2GArguments<T, D> a_;
   Tensor copies_;
   bool reads_F_ = false, reads_J_ = false, viscous_ = false, rearranged_ = false;
-  bool owned_ = false, moved_ = true;  // whether the fields have gone to buffers; whether some have since the last step
-  int64_t breaks_ = 0, all_breaks_ = 0;  // of this substep, and since particles changed places
+  bool owned_ = false, moved_ = true;  // whether the fields are in buffers; whether some have moved since the last step
+  int64_t breaks_ = 0, all_breaks_ = 0;  // of this substep, and since the last reorder
   Drift drift_{};
   Whereabouts whereabouts_{};
   double rounding_;                     // of positions [cells]
   int64_t passes_ = 0;                  // since the activation
-  int patience_ = 0;                    // activations until the next one that is to last
-  bool tries_ = false, lasts_ = false;  // whether this activation is to last; whether a pass takes the next substep
+  int patience_ = 0;                    // activations before the next attempt to let one last
+  bool tries_ = false, lasts_ = false;  // whether this activation may last; whether a pass computes the next substep
 };
 
 template <class T, int D>
-OwnParticles<T, D>::OwnParticles(Substeps<T, D>& steps, const Tensor& packed_history, bool sorts,
-                                 backend::Stream stream)
+SortedCpu<T, D>::SortedCpu(Substeps<T, D>& steps, const Tensor& packed_history, bool sorts, backend::Stream stream)
     : s_(steps), in_(steps.in), sorts_(sorts), stream_(stream) {
   const Tensor& like = in_.x;
   const int64_t P = like.size(0);
@@ -187,9 +185,9 @@ OwnParticles<T, D>::OwnParticles(Substeps<T, D>& steps, const Tensor& packed_his
   a_.copies = static_cast<T*>(copies_.data_ptr());
 }
 
-// Position on the lattice, along an axis.
+// Largest coordinate of the lattice.
 template <class T, int D>
-double OwnParticles<T, D>::farthest() const {
+double SortedCpu<T, D>::farthest() const {
   const Geometry<T, D>& g = s_.activation.geometry;
   double most = 0;
   for (int a = 0; a < D; a++)
@@ -198,7 +196,7 @@ double OwnParticles<T, D>::farthest() const {
 }
 
 template <class T, int D>
-void OwnParticles<T, D>::find_laws() {
+void SortedCpu<T, D>::find_laws() {
   for (size_t k = 0; k < s_.laws.size(); k++) {
     const LawCall& call = s_.calls[k];
     const LawInfo& info = call.law->info;
@@ -229,12 +227,12 @@ void OwnParticles<T, D>::find_laws() {
   }
 }
 
-// A break in the order of the particles costs every substep about as much as a particle does, and a particle that
-// changes places a quarter of that; the way back in the end costs a substep.
+// A break in the order of the particles costs every substep about as much as a particle; reordering a particle costs a
+// quarter of that, and the restoration at the end one substep.
 template <class T, int D>
-bool OwnParticles<T, D>::pays(int64_t following) {
+bool SortedCpu<T, D>::pays(int64_t following) {
   if (!sorts_) return false;
-  if (in_.lattice.deterministic())  // by nothing that depends on other scenes
+  if (in_.lattice.deterministic())  // independent of other scenes
     return following >= kDeterministicSteps && (in_.n - 1 - following) % kDeterministicSteps == 0;
   const int64_t P = in_.x.size(0);
   all_breaks_ += breaks_;
@@ -242,9 +240,9 @@ bool OwnParticles<T, D>::pays(int64_t following) {
 }
 
 template <class T, int D>
-bool OwnParticles<T, D>::step(const int* status_before, int* status, int64_t following) {
+bool SortedCpu<T, D>::step(const int* status_before, int* status, int64_t following) {
   if (lasts_)
-    go_on(status_before, status);
+    run_substep(status_before, status);
   else if (!begin(status_before, status, following))
     return false;
   s_.move_nodes(stream_);
@@ -256,7 +254,7 @@ bool OwnParticles<T, D>::step(const int* status_before, int* status, int64_t fol
 
 // From an activation to the nodes.
 template <class T, int D>
-bool OwnParticles<T, D>::begin(const int* status_before, int* status, int64_t following) {
+bool SortedCpu<T, D>::begin(const int* status_before, int* status, int64_t following) {
   s_.activation.x = x.now();
   s_.activation.scene = scene_.now().pointer;
   s_.activation.scene_stride = scene_.now().stride[0];
@@ -275,7 +273,7 @@ bool OwnParticles<T, D>::begin(const int* status_before, int* status, int64_t fo
 }
 
 template <class T, int D>
-void OwnParticles<T, D>::keep_velocities() {
+void SortedCpu<T, D>::keep_velocities() {
   set_p2g();
   s_.keep_velocities(a_.p2g, kept_.next(false), stream_);
   kept_.go(false);
@@ -283,7 +281,7 @@ void OwnParticles<T, D>::keep_velocities() {
 
 // G2P, laws and P2G, while an activation lasts.
 template <class T, int D>
-void OwnParticles<T, D>::go_on(const int* status_before, int* status) {
+void SortedCpu<T, D>::run_substep(const int* status_before, int* status) {
   for (int64_t k = 0; k < (1 + in_.scenes) * kStatusSize; k++) status[k] = status_before[k];
   status[kActivations]++;
   s_.clear_nodes(stream_);
@@ -291,15 +289,15 @@ void OwnParticles<T, D>::go_on(const int* status_before, int* status) {
 }
 
 template <class T, int D>
-bool OwnParticles<T, D>::tries_to_last(int64_t following) {
+bool SortedCpu<T, D>::tries_to_last(int64_t following) {
   if (!sorts_ || !may_last(in_) || following < (rearranged_ ? kLeastPasses : kLeastLastingSteps)) return false;
   return patience_ == 0 || --patience_ == 0;
 }
 
-// Whether a pass can take the next substep. The last one has an activation of its own in any case, so that the status
-// tells how many blocks there are by then.
+// Whether a pass can compute the next substep. The last one always has its own activation, whose status counts the
+// blocks at the end.
 template <class T, int D>
-bool OwnParticles<T, D>::lasts(int64_t following) {
+bool SortedCpu<T, D>::lasts(int64_t following) {
   if (!tries_ || following < kLeastPasses) return false;
   drift_ = {whereabouts_.strays, 0, drift_.earlier + drift_.strays};
   const bool result = drift_.lasts(in_.x.size(0), kStraysOfRenewal) && reaches();
@@ -307,10 +305,10 @@ bool OwnParticles<T, D>::lasts(int64_t following) {
   return result;
 }
 
-// Whether all particles stay near their base blocks in the next G2P: none moves by more than the largest velocity of a
-// node, of which its own is a mean.
+// Whether all particles stay near their base blocks in the next G2P. No particle is faster than the fastest node, since
+// its velocity is a mean over nodes.
 template <class T, int D>
-bool OwnParticles<T, D>::reaches() {
+bool SortedCpu<T, D>::reaches() {
   T longest = 0;
   LongestMoveArguments<T, D> a;
   a.nodes = s_.velocities();
@@ -321,11 +319,11 @@ bool OwnParticles<T, D>::reaches() {
   a.longest = &longest;
   backend::longest_move(a, stream_);
   const double cells = double(longest) * in_.dt / in_.lattice.dx();
-  return cells * (1 + rounding_) + rounding_ < double(whereabouts_.slack);
+  return cells * (1 + rounding_) + rounding_ < double(whereabouts_.displacement_budget);
 }
 
 template <class T, int D>
-void OwnParticles<T, D>::give_to_nodes(bool rearranges) {
+void SortedCpu<T, D>::give_to_nodes(bool rearranges) {
   if (rearranges && !rearranged_) {
     origin_ = OwnField<int>(empty_int(in_.x, {in_.x.size(0)}));
     int* const origin = origin_.next(false).pointer;
@@ -350,9 +348,9 @@ void OwnParticles<T, D>::give_to_nodes(bool rearranges) {
   all_breaks_ = 0;
 }
 
-// Where the rows of the particles are, and go to.
+// Lists the rows of the particles with their sources and destinations.
 template <class T, int D>
-void OwnParticles<T, D>::find_rows(bool rearranges) {
+void SortedCpu<T, D>::find_rows(bool rearranges) {
   rows_.clear();
   numbers_.clear();
   for_fields([&](OwnField<T>& f, int row, bool read, bool changes) {
@@ -363,7 +361,7 @@ void OwnParticles<T, D>::find_rows(bool rearranges) {
   if (rearranges) origin_.rows(numbers_, kOriginRow, true, true);
   if (has(in_.scene)) scene_.rows(numbers_, kSceneRow, rearranges, true);
   if (has(in_.material)) material_.rows(numbers_, kMaterialRow, rearranges, true);
-  find_expected(true);
+  find_prefetched(true);
   a_.rows = rows_.data();
   a_.row_count = int(rows_.size());
   a_.numbers = numbers_.data();
@@ -372,24 +370,24 @@ void OwnParticles<T, D>::find_rows(bool rearranges) {
   a_.rearranges = rearranges;
 }
 
-// The rows that laws and P2G read.
+// Lists the rows that laws and P2G read, for prefetches.
 template <class T, int D>
-void OwnParticles<T, D>::find_expected(bool motion) {
+void SortedCpu<T, D>::find_prefetched(bool motion) {
   std::vector<ParticleRow<T>> read;
   for_fields([&](OwnField<T>& f, int row, bool read_by_laws, bool) {
     if (row < 0 || read_by_laws) f.rows(read, row, false, false);
   });
   if (motion) v.rows(read, -1, false, false);
   if (motion && C.now().pointer) C.rows(read, -1, false, false);
-  expected_.clear();
+  prefetched_.clear();
   for (const ParticleRow<T>& r : read)
-    if (r.stride == 1) expected_.push_back(r.from);
-  a_.expected = expected_.data();
-  a_.expected_count = int(expected_.size());
+    if (r.stride == 1) prefetched_.push_back(r.from);
+  a_.prefetched = prefetched_.data();
+  a_.prefetched_count = int(prefetched_.size());
 }
 
 template <class T, int D>
-void OwnParticles<T, D>::set_p2g() {
+void SortedCpu<T, D>::set_p2g() {
   a_.p2g = s_.p2g;
   a_.p2g.x = x.now();
   a_.p2g.mass = mass_.now();
@@ -401,7 +399,7 @@ void OwnParticles<T, D>::set_p2g() {
 }
 
 template <class T, int D>
-void OwnParticles<T, D>::set_advance() {
+void SortedCpu<T, D>::set_advance() {
   G2PAdvanceArguments<T, D>& a = s_.advance;
   a.gather.x = x.now();
   a.F = F.now();
@@ -415,15 +413,15 @@ void OwnParticles<T, D>::set_advance() {
   if (has(in_.residual)) a.residual_next = residual.next(false);
 }
 
-// G2P of the substep before, and laws and P2G of this one if it follows.
+// G2P of the previous substep, then laws and P2G of this one if `follows`.
 template <class T, int D>
-void OwnParticles<T, D>::pass(bool follows) {
+void SortedCpu<T, D>::pass(bool follows) {
   set_advance();
   if (passes_ == 0) {
-    v.go(false);  // of particles outside; of others there is nothing to read before the last pass
+    v.go(false);  // values of particles outside; those of others are not read before the last pass
     if (in_.wants_C) C.go(false);
     find_rows(false);
-    find_expected(false);
+    find_prefetched(false);
     moved_ = true;
   }
   set_p2g();
@@ -437,7 +435,7 @@ void OwnParticles<T, D>::pass(bool follows) {
 }
 
 template <class T, int D>
-void OwnParticles<T, D>::advance() {
+void SortedCpu<T, D>::advance() {
   if (passes_ > 0) {
     pass(false);
   } else {
@@ -454,7 +452,7 @@ void OwnParticles<T, D>::advance() {
 }
 
 template <class T, int D>
-void OwnParticles<T, D>::give_back() {
+void SortedCpu<T, D>::restore_order() {
   if (!rearranged_) return;
   rows_.clear();
   const auto each = [&](const auto& visit) {

@@ -6,10 +6,10 @@
 // map one small file repeatedly.
 namespace mpm::cpu {
 
-constexpr int64_t kOnes = 8 << 20;  // number of bytes from which this costs less than setting all bits
+constexpr int64_t kLazyTable = 8 << 20;  // number of bytes from which this costs less than setting all bits
 
 // Null where the system does not support it. Any thread may call both.
-void* take_ones(int64_t bytes);
-void give_back_ones(void* data, int64_t bytes);
+void* allocate_lazy_table(int64_t bytes);
+void free_lazy_table(void* data, int64_t bytes);
 
 }  // namespace mpm::cpu

@@ -8,18 +8,19 @@
 namespace mpm::cpu {
 inline namespace TORCH_MPM_ISA {
 
-// What particles have left to go before their activation no longer serves them: on each axis they may be in the cells
-// of their base block and in one more on both sides, and must stay on the lattice. For quadratic splines.
+// Displacement budget: cells that particles can still move on each axis within their activation. They may be in the
+// cells of their base block and in one more on both sides, and must stay on the lattice. For quadratic splines.
 template <class T, int D>
-class Slack {
+class DisplacementBudget {
  public:
   static constexpr int N = kWideLanes<T>;
   using P = Pack<T, N>;
 
-  // `all`, which may be null, gets it in the end.
-  Slack(const Geometry<T, D>& geometry, Whereabouts* all) : geometry_(geometry), all_(all), most_(-kBlockWidth) {}
-  ~Slack() {
-    if (all_) tell();
+  // `all`, which may be null, receives the budget of all particles at the end.
+  DisplacementBudget(const Geometry<T, D>& geometry, Whereabouts* all)
+      : geometry_(geometry), all_(all), most_(-kBlockWidth) {}
+  ~DisplacementBudget() {
+    if (all_) flush();
   }
 
   void begin(const BaseBlock<T, D>& base_block) {
@@ -30,7 +31,7 @@ class Slack {
     }
   }
 
-  // Particles of which the first `count` are there.
+  // Adds the first `count` particles of a pack.
   MPM_HD void add(const P x[D], int count) {
     P most = most_;
     MPM_UNROLL for (int a = 0; a < D; a++) {
@@ -46,13 +47,13 @@ class Slack {
   }
 
  private:
-  void tell() const {
+  void flush() const {
     T most = most_[0];
     for (int l = 1; l < N; l++) most = most_[l] > most ? most_[l] : most;
     const float own = float(-most);
     float now;
-    __atomic_load(&all_->slack, &now, __ATOMIC_RELAXED);
-    while (own < now && !__atomic_compare_exchange(&all_->slack, &now, const_cast<float*>(&own), false,
+    __atomic_load(&all_->displacement_budget, &now, __ATOMIC_RELAXED);
+    while (own < now && !__atomic_compare_exchange(&all_->displacement_budget, &now, const_cast<float*>(&own), false,
                                                    __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {
     }
   }
@@ -60,7 +61,7 @@ class Slack {
   const Geometry<T, D>& geometry_;
   Whereabouts* const all_;
   P low_[D], high_[D];
-  P most_;  // of what particles are beyond these
+  P most_;  // largest excess over these
 };
 
 }  // namespace TORCH_MPM_ISA

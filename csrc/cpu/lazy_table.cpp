@@ -1,4 +1,4 @@
-#include "cpu/ones.h"
+#include "cpu/lazy_table.h"
 
 #include <sys/mman.h>
 #ifdef __linux__
@@ -16,11 +16,11 @@ namespace {
 // Size of the file: a mapping of each piece costs some microseconds, and a process may have 65530 of them.
 constexpr int64_t kPiece = 16 << 20;
 
-// The file, which is not written any more. A process may close unknown descriptors, and another file then gets the
+// The file, which is not written again. A process may close unknown descriptors, and another file then gets the
 // number.
-class OnesFile {
+class LazyTableFile {
  public:
-  OnesFile() : descriptor_(memfd_create("torch_mpm", MFD_CLOEXEC)) {
+  LazyTableFile() : descriptor_(memfd_create("torch_mpm", MFD_CLOEXEC)) {
     if (descriptor_ < 0) return;
     void* const p = ftruncate(descriptor_, kPiece) == 0
                         ? mmap(nullptr, kPiece, PROT_READ | PROT_WRITE, MAP_SHARED, descriptor_, 0)
@@ -33,7 +33,7 @@ class OnesFile {
     if (!made_) close(descriptor_);
   }
 
-  // -1 where there is none, or no longer one.
+  // Descriptor of the file; -1 if there is none, or if it was closed.
   int descriptor() const {
     struct stat now;
     if (!made_ || fstat(descriptor_, &now) != 0) return -1;
@@ -49,10 +49,10 @@ class OnesFile {
 
 }  // namespace
 
-void* take_ones([[maybe_unused]] int64_t bytes) {
+void* allocate_lazy_table([[maybe_unused]] int64_t bytes) {
 #ifdef __linux__
-  static const OnesFile ones;
-  const int file = ones.descriptor();
+  static const LazyTableFile table;
+  const int file = table.descriptor();
   if (file < 0) return nullptr;
   constexpr int protection = PROT_READ | PROT_WRITE, flags = MAP_PRIVATE | MAP_NORESERVE;
   void* const all = mmap(nullptr, size_t(bytes), protection, flags | MAP_ANONYMOUS, -1, 0);
@@ -60,7 +60,7 @@ void* take_ones([[maybe_unused]] int64_t bytes) {
   for (int64_t begin = 0; begin < bytes; begin += kPiece) {
     char* const piece = static_cast<char*>(all) + begin;
     if (mmap(piece, size_t(std::min(kPiece, bytes - begin)), protection, flags | MAP_FIXED, file, 0) == MAP_FAILED) {
-      give_back_ones(all, bytes);
+      free_lazy_table(all, bytes);
       return nullptr;
     }
   }
@@ -70,6 +70,6 @@ void* take_ones([[maybe_unused]] int64_t bytes) {
 #endif
 }
 
-void give_back_ones(void* data, int64_t bytes) { munmap(data, size_t(bytes)); }
+void free_lazy_table(void* data, int64_t bytes) { munmap(data, size_t(bytes)); }
 
 }  // namespace mpm::cpu
