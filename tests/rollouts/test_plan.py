@@ -226,6 +226,17 @@ def test_plans_of_rollouts_with_gradients(device):
     assert least.checkpoints is not None and least.checkpoints.memory is None and not least.stores_all
 
 
+def test_frames_are_those_of_the_plan(device):
+    step, state = elastic(device)
+    with torch.no_grad():
+        plan = mpm.plan_rollout(step, state, 5, DT, schedule="per_step")
+        movie = mpm.frames(step, state, 10, DT, every=5, plan=plan)
+        assert SCHEDULES[torch.ops.torch_mpm.latest_schedule(state.x)] == "per_step"
+        torch.testing.assert_close(movie.end.x, mpm.frames(step, state, 10, DT, every=5, schedule="per_step").end.x)
+        with pytest.raises(ValueError, match="must be None with a plan"):
+            mpm.frames(step, state, 10, DT, every=5, schedule="per_step", plan=plan)
+
+
 def test_plans_of_steps_from_python(device):
     step, state = elastic(device, on_grid=lambda blocks, v, m, dt: v)
     plan = mpm.plan_rollout(step, state, 20, DT, graph=4)

@@ -12,6 +12,7 @@ from ..state.state import State
 from ..step.step import Step
 from .checkpoints import Checkpoints, fitting
 from .memory import state_bytes, step_bytes
+from .steps import Steps
 
 PADDING = 87 * 64
 """Largest padding between two rows of particles on the CPU [bytes], csrc/common/tensors.h."""
@@ -24,17 +25,13 @@ KEPT_BYTES = {"cpu": 2**24, "cuda": 2**29}
 the caches of a CPU; on CUDA enough that the kernels hide the time of Python."""
 
 
-def resolved(
-    kept: Checkpoints,
-    step: Callable[[State, float | Tensor], State],
-    state: State,
-    n: int,
-    dt: float | Tensor,
-    fused: bool,
-) -> Checkpoints | None:
-    """Checkpoints of n steps that fit into a budget of memory; None if all steps fit."""
-    assert kept.memory is not None
-    return fitting(kept.memory, n, *bytes_kept(step, state, dt, fused), kept.offload)
+def resolved(steps: Steps, state: State, fused: bool) -> Checkpoints | None:
+    """Checkpoints of steps in their budget of memory, if they have one: `EVERYTHING` if all steps fit."""
+    kept = steps.checkpoints
+    if kept is None or kept.memory is None or kept is EVERYTHING:
+        return kept
+    sizes = bytes_kept(steps.step, state, steps.dt, fused)
+    return fitting(kept.memory, steps.n, *sizes, kept.offload) or EVERYTHING
 
 
 def bytes_kept(

@@ -19,6 +19,7 @@ from .hooks import Parts
 from .memory import differentiable, seconds
 from .plan import RolloutPlan, plan_of_steps
 from .run import rollout
+from .steps import Steps
 
 TRIAL = 4
 """Number of steps of the measurement."""
@@ -85,7 +86,7 @@ def estimate_rollout(
     first = parts.first_with_gradient()
     start = differentiable(step.prepare(state) if isinstance(step, Step) else state)
     with aside(step, start.x), torch.enable_grad():
-        plan = plan_of_steps(step, start, n - first, dt, kept)
+        plan = plan_of_steps(Steps(step, n - first, dt, kept), start)
         return _estimate(step, start, n - first, first, dt, plan)
 
 

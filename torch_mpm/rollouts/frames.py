@@ -13,6 +13,7 @@ from ..state.state import State, check_state
 from ..step.step import Step
 from .checkpoints import Checkpoints
 from .hooks import Hook, Parts
+from .plan import RolloutPlan
 from .run import rollout
 
 
@@ -41,11 +42,13 @@ def frames(
     prefix: int = 0,
     truncate: int | None = None,
     graph: int | None = None,
+    schedule: str | None = None,
+    plan: RolloutPlan | None = None,
 ) -> Frames:
     """A `rollout` that stores some fields of every n-th step, and lets a hook act there.
 
     Args:
-        step, state, n, dt, checkpoint, prefix, truncate, graph: as `rollout`.
+        step, state, n, dt, checkpoint, prefix, truncate, graph, schedule, plan: as `rollout`.
         every: steps between two frames.
         fields: names of fields of `State` or of `state.extra`.
         hook: called as `hook(state, k)` before step k = 0, every, 2 every, ..., after the frame of that step is stored.
@@ -79,6 +82,7 @@ def frames(
 
     Parts(n, hook=hook)  # `rollout` refuses a hook that is not callable.
     options: dict[str, Any] = {"prefix": prefix, "truncate": truncate, "graph": graph}
+    options |= {"schedule": schedule, "plan": plan}
     end = rollout(step, state, n, dt, checkpoint, hook=seen, every=every, **options)
     if n % every == 0:
         keep(end)

@@ -25,15 +25,17 @@ from ..step.step import Step
 from .checkpoints import binomial, offloaded
 from .plan import SCHEDULES, RolloutPlan, differentiates, follows_paths, why_not_fused
 from .sorting import STEPS_IN_ORDER, restore_order, sort_particles
+from .steps import Steps
 
 
-def in_calls(step: Step, state: State, n: int, dt: float | Tensor, plan: RolloutPlan) -> State:
-    """The state n steps later, by calls of the fused op as planned. The op recomputes steps for the backward pass
+def in_calls(steps: Steps, state: State, plan: RolloutPlan) -> State:
+    """The state after the steps, by calls of the fused op as planned. The op recomputes steps for the backward pass
     where it may not store all that their gradient needs."""
-    assert plan.facts is not None
+    step, n, dt, *_ = steps
+    assert plan.facts is not None and isinstance(step, Step)
     with_gradient, kept = plan.facts.gradients, plan.checkpoints
     if plan.sorts:
-        return _in_order(step, step.prepare(state), n, dt, plan)
+        return _in_order(steps, state, plan)
     schedule = plan.schedule if plan.forced else None
 
     def advance(state: State, count: int, first: int = 0) -> State:
@@ -52,15 +54,16 @@ def in_calls(step: Step, state: State, n: int, dt: float | Tensor, plan: Rollout
         return advance(state, n)
 
 
-def _in_order(step: Step, given: State, n: int, dt: float | Tensor, plan: RolloutPlan) -> State:
+def _in_order(steps: Steps, state: State, plan: RolloutPlan) -> State:
     """`in_calls` for particles that are sorted every `STEPS_IN_ORDER` steps, and restored to their order at the end."""
-    assert plan.facts is not None
+    step, n = steps.step, steps.n
+    assert plan.facts is not None and isinstance(step, Step)
+    end = given = step.prepare(state)
     most = n if plan.facts.gradients else STEPS_IN_ORDER
     plan = plan.of_sorted()
-    end = given
     for first in range(0, n, most):
         start = sort_particles(step, end)
-        end = in_calls(step, start, min(most, n - first), dt, plan)
+        end = in_calls(steps.some(min(most, n - first), first), start, plan)
     return restore_order(step, end, start, given)
 
 

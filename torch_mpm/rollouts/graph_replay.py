@@ -8,6 +8,7 @@ from ..cuda_graphs.graph import Replays, WorkInFlight, time_tensor
 from ..state.state import State
 from ..step.clocks import time_after
 from ..step.step import Step
+from .steps import Steps
 
 LEAST_STEPS = 6
 """Least number of replays for which a step is recorded: a recording takes the host as long as one or two steps."""
@@ -15,13 +16,15 @@ CHUNK = 64
 """Steps between two queries of the number of active blocks, for a pool that grows with the scene on CUDA."""
 
 
-def replayed(step: Step, state: State, n: int, dt: float) -> State:
-    """The state n steps later: the first step from Python, the others as replays of a graph, for plans with the
+def replayed(steps: Steps, state: State) -> State:
+    """The state after the steps: the first step from Python, the others as replays of a graph, for plans with the
     executor "replay".
 
     The first step creates the tensors that later steps reuse, and makes the checks that wait for the device, which a
     graph cannot.
     """
+    step, n, dt, *_ = steps
+    assert isinstance(step, Step)
     time = time_after(state.time, dt, n)
     # The time is a tensor in the graph, which cannot read the host's time, so that obstacles that begin later are
     # part of it. It stays a number if no part of the step reads the time, except before time zero, the default begin

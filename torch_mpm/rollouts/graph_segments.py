@@ -24,6 +24,7 @@ from ..state.state import State, check_state
 from ..step.clocks import time_after
 from ..step.status import counts_of, uncounted
 from ..step.step import Step
+from .steps import Steps
 
 TRIALS = 3
 """Number of times that steps are computed from Python before they are recorded, as torch does: compilers of user code
@@ -83,12 +84,14 @@ def make_graphed_step(step: nn.Module, state: State | None, dt: float, n: int = 
 # ---- in rollouts
 
 
-def graphed_steps(step: nn.Module, state: State, n: int, dt: float, most: int) -> State:
-    """The state n steps later, by graphs of `most` steps and one of the remaining steps, for plans with the executor
+def graphed_steps(steps: Steps, state: State, most: int) -> State:
+    """The state after the steps, by graphs of `most` steps and one of the remaining steps, for plans with the executor
     "graph".
 
     The inputs of each graph are stored for the backward pass, which recomputes the steps of all but the last one.
     """
+    step, n, dt, *_ = steps
+    assert isinstance(step, nn.Module) and not isinstance(dt, Tensor)
     recordings = step.__dict__.setdefault("_recordings", Recordings())
     known = StepKey(step)
     in_flight = WorkInFlight(state.x, most)

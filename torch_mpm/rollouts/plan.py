@@ -35,6 +35,7 @@ from .anomaly import detecting
 from .budget import EVERYTHING, resolved, steps_of_a_call
 from .checkpoints import Checkpoints, as_checkpoints
 from .graph_replay import LEAST_STEPS
+from .steps import Steps
 
 Executor = Literal["fused", "replay", "graph", "loop"]
 SCHEDULES = ("per_step", "fused_g2p2g", "persistent", "block_per_scene", "sorted_cpu")
@@ -205,70 +206,55 @@ def plan_rollout(
     check_state(state)
     if isinstance(step, Step):
         split_dt(dt, step.grid.scenes, state.x)
-    return plan_of_steps(step, state, n, dt, kept, graph, schedule)
+    return plan_of_steps(Steps(step, n, dt, kept, graph, schedule), state)
 
 
-def plan_of_steps(
-    step: Callable[[State, float | Tensor], State],
-    state: State,
-    n: int,
-    dt: float | Tensor,
-    checkpoints: Checkpoints | None = None,
-    graph: int | None = None,
-    schedule: str | None = None,
-) -> RolloutPlan:
+def plan_of_steps(steps: Steps, state: State) -> RolloutPlan:
     """`plan_rollout` for arguments that were checked."""
-    if schedule is not None:
-        check_choice("schedule", schedule, SCHEDULES)
-    no_op = why_not_fused(step, state, dt)
-    if checkpoints is not None:
-        checkpoints = _that_fit(checkpoints, step, state, n, dt, no_op is None)
+    if steps.schedule is not None:
+        check_choice("schedule", steps.schedule, SCHEDULES)
+    no_op = why_not_fused(steps.step, state, steps.dt)
+    checkpoints = None if steps.checkpoints is None else _that_fit(steps, state, no_op is None)
     if no_op is None:
-        return _fused(step, state, n, dt, checkpoints, schedule)  # type: ignore[arg-type]
-    if schedule is not None:
+        return _fused(steps, state, checkpoints)
+    if steps.schedule is not None:
         raise ValueError(
-            f"schedule must be None for steps that the fused op does not support, got {schedule!r}: {no_op}"
+            f"schedule must be None for steps that the fused op does not support, got {steps.schedule!r}: {no_op}"
         )
     reasons = {"fused": no_op}
-    no_replay = _why_not_replay(step, state, n, dt)
+    no_replay = _why_not_replay(steps, state)
     if no_replay is None:
         reasons |= {"graph": "replays of one step suffice without user functions", "loop": "a graph is faster"}
         return RolloutPlan("replay", None, 1, None, False, checkpoints, reasons)
     reasons["replay"] = no_replay
-    no_graph = _why_not_graphs(step, state, dt)
-    if no_graph is None and graph is not None:
+    no_graph = _why_not_graphs(steps, state)
+    if no_graph is None and steps.graph is not None:
         reasons["loop"] = "graphs are faster"
-        return RolloutPlan("graph", None, max(min(graph, n), 1), None, False, checkpoints, reasons)
+        return RolloutPlan("graph", None, max(min(steps.graph, steps.n), 1), None, False, checkpoints, reasons)
     reasons["graph"] = no_graph or "rollout(graph=...) launches some steps as a graph"
     return RolloutPlan("loop", None, 1, None, False, checkpoints, reasons)
 
 
-def _that_fit(
-    checkpoints: Checkpoints, step: Any, state: State, n: int, dt: float | Tensor, fused: bool
-) -> Checkpoints | None:
+def _that_fit(steps: Steps, state: State, fused: bool) -> Checkpoints | None:
     """Checkpoints without a budget of memory; `EVERYTHING` where all steps fit, None where nothing is stored."""
     if not torch.is_grad_enabled():
         return None
-    if checkpoints.memory is None or checkpoints is EVERYTHING:
-        return checkpoints
-    return resolved(checkpoints, step, state, n, dt, fused) or EVERYTHING
+    return resolved(steps, state, fused)
 
 
 _INSTEAD = {name: "the op computes all steps" for name in ("replay", "graph", "loop")}
 
 
-def _fused(
-    step: Step, state: State, n: int, dt: float | Tensor, checkpoints: Checkpoints | None, schedule: str | None
-) -> RolloutPlan:
-    facts = facts_of(step, state, n, dt, checkpoints is EVERYTHING)
-    plan = _planned(schedule, facts)
+def _fused(steps: Steps, state: State, checkpoints: Checkpoints | None) -> RolloutPlan:
+    facts = facts_of(steps, state, checkpoints is EVERYTHING)
+    plan = _planned(steps.schedule, facts)
     if checkpoints is None and not facts.gradients:
         return plan
-    steps = plan.steps_per_call
+    together = plan.steps_per_call
     if facts.gradients and checkpoints is not EVERYTHING:
         every = None if checkpoints is None else checkpoints.every
-        steps = min(steps, every or steps_of_a_call(state, n))
-    return dataclasses.replace(plan, steps_per_call=steps, checkpoints=checkpoints)
+        together = min(together, every or steps_of_a_call(state, steps.n))
+    return dataclasses.replace(plan, steps_per_call=together, checkpoints=checkpoints)
 
 
 @functools.lru_cache(maxsize=1024)
@@ -335,7 +321,7 @@ def _why_not_eager(x: Tensor) -> str | None:
 
 
 def _why_no_graph(step: nn.Module, state: State, dt: float | Tensor) -> str | None:
-    """Reason why the steps cannot be captured in CUDA graphs."""
+    """Reason why steps cannot be captured in CUDA graphs."""
     if isinstance(dt, Tensor):
         return "dt is a tensor"
     if (reason := _why_not_eager(state.x)) is not None:
@@ -350,14 +336,15 @@ def _why_no_graph(step: nn.Module, state: State, dt: float | Tensor) -> str | No
     return None
 
 
-def _why_not_replay(step: Any, state: State, n: int, dt: float | Tensor) -> str | None:
+def _why_not_replay(steps: Steps, state: State) -> str | None:
     """Reason why `replayed` does not support the steps; None if it does. Unknown functions are called from Python: a
     function may count its calls, or read the time."""
+    step = steps.step
     if type(step) is not Step:
         return "it is not a plain Step"
     if not state.x.is_cuda:
         return "there are no graphs on the CPU"
-    if (reason := _why_no_graph(step, state, dt)) is not None:
+    if (reason := _why_no_graph(step, state, steps.dt)) is not None:
         return reason
     if isinstance(state.time, Tensor):
         return "the time of the state is a tensor"
@@ -365,16 +352,17 @@ def _why_not_replay(step: Any, state: State, n: int, dt: float | Tensor) -> str 
         return "it is differentiated"
     if (reason := _foreign(step, state.x.device, [])) is not None:
         return reason
-    return f"there are no more than {LEAST_STEPS} steps" if n <= LEAST_STEPS else None
+    return f"there are no more than {LEAST_STEPS} steps" if steps.n <= LEAST_STEPS else None
 
 
-def _why_not_graphs(step: Any, state: State, dt: float | Tensor) -> str | None:
+def _why_not_graphs(steps: Steps, state: State) -> str | None:
     """Reason why `graphed_steps` does not support the steps; None if it does."""
+    step = steps.step
     if not isinstance(step, nn.Module):
         return "it is no module"
     if not graph_segments.has_graphs(state.x.device):
         return "there are no graphs on the CPU"
-    if (reason := _why_no_graph(step, state, dt)) is not None:
+    if (reason := _why_no_graph(step, state, steps.dt)) is not None:
         return reason
     if (place := graph_segments.another_device(step, state.x.device)) is not None:
         return f"a tensor of it is on {place}, the particles on {state.x.device}"
@@ -416,12 +404,14 @@ def _all_of(step: Step) -> list[Tensor]:
 # ---- facts of the fused op
 
 
-def facts_of(step: Step, state: State, n: int, dt: float | Tensor, stores_all: bool = False) -> Facts:
-    """Facts of n steps in the fused op."""
+def facts_of(steps: Steps, state: State, stores_all: bool = False) -> Facts:
+    """Facts of steps in the fused op."""
+    step, n, dt = steps.step, steps.n, steps.dt
+    assert isinstance(step, Step)
     x, grid = state.x, step.grid
     law = step.law
     laws, moved = laws_of(law), law.state_fields
-    gradients = wants_gradient(step, state, n, dt)
+    gradients = wants_gradient(steps, state)
     return Facts(
         x.is_cuda,
         x.dtype == torch.float32,
@@ -477,10 +467,12 @@ def has_mirrors(step: Step) -> bool:
     return step.walls is not None and step.walls.mirrors() is not None
 
 
-def wants_gradient(step: Step, state: State, n: int = 1, dt: float | Tensor = 1.0) -> bool:
-    """Whether the fused op is differentiated. Functions of time are called at the first and the last of n steps."""
+def wants_gradient(steps: Steps, state: State) -> bool:
+    """Whether the fused op is differentiated. Functions of time are called at the first and the last of the steps."""
     if not torch.is_grad_enabled():
         return False
+    step, n, dt, *_ = steps
+    assert isinstance(step, Step)
     if differentiates(step, state, dt):
         return True
     if not follows_paths(step):

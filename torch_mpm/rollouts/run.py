@@ -8,13 +8,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..boundaries.control import control_step
 from ..errors import check_count, shape_of
 from ..ops.arguments import split_dt
 from ..state.state import State, check_state
 from ..step.step import Step
 from .anomaly import begin, detecting, watch
-from .budget import EVERYTHING, resolved
+from .budget import resolved
 from .checkpoints import Checkpoints, as_checkpoints, binomial, in_segments
 from .fused_op import in_calls
 from .gradient_norms import GradientNorms
@@ -22,6 +21,7 @@ from .graph_replay import replayed
 from .graph_segments import graphed_steps
 from .hooks import Hook, Parts
 from .plan import RolloutPlan, plan_of_steps, why_not_fused
+from .steps import Steps
 
 
 def rollout(
@@ -95,91 +95,81 @@ def rollout(
     if not callable(step):
         raise TypeError(f"step must be a Step or a function (state, dt) -> state, got {shape_of(step)}")
     check_count("n", n)
-    kept = as_checkpoints(checkpoint)
     if graph is not None:
         check_count("graph", graph, 1)
+    steps = Steps(step, n, dt, as_checkpoints(checkpoint), graph, schedule)
     if plan is not None:
         if checkpoint is not None or graph is not None or schedule is not None:
             raise ValueError("checkpoint, graph and schedule must be None with a plan, which has them")
-        kept, graph, schedule = _parts_of(plan)
+        steps = _as_planned(steps, plan)
     if truncate is None and hook is None and norms is None and prefix == 0 and every == 1 and every is not True:
         check_state(state)
-        with control_step(step, state, n, dt) as left:
-            return left(_taken(step, state, n, dt, kept, graph=graph, schedule=schedule, given=plan))
-    parts = Parts(n, prefix, truncate, hook, every, norms)
+        with steps.control(state) as left:
+            return left(_computed(steps, state, plan))
+    return _in_parts(steps, state, Parts(n, prefix, truncate, hook, every, norms), plan)
+
+
+def _in_parts(steps: Steps, state: State, parts: Parts, plan: RolloutPlan | None) -> State:
+    """The state after the steps of a rollout that is divided by hooks, cuts of the gradient or its norms."""
+    step, scales = steps.step, (1, 1.0, steps.dt)
     if isinstance(step, Step):
-        state = step.prepare(state)
-        split_dt(dt, step.grid.scenes, state.x)  # which checks it
-    if kept is not None and kept.memory is not None and torch.is_grad_enabled():  # the same for all parts
-        fused = why_not_fused(step, state, dt) is None
-        kept = resolved(kept, step, state, n - parts.first_with_gradient(), dt, fused) or EVERYTHING
-    grid = step.grid if isinstance(step, Step) else None
-    scales = (1, 1.0, dt) if grid is None else (grid.scenes, grid.dx, dt)
+        state, grid = step.prepare(state), step.grid
+        split_dt(steps.dt, grid.scenes, state.x)  # which checks it
+        scales = grid.scenes, grid.dx, steps.dt
+    if torch.is_grad_enabled():  # The budget of memory is the same for all parts.
+        with_gradient = steps.some(steps.n - parts.first_with_gradient())
+        fused = steps.checkpoints is not None and why_not_fused(step, state, steps.dt) is None
+        steps = steps._replace(checkpoints=resolved(with_gradient, state, fused))
 
     def advance(state: State, count: int, k: int) -> State:
-        return _taken(step, state, count, dt, kept, k, graph, schedule, plan)
+        return _computed(steps.some(count, k), state, plan)
 
-    return parts.run(advance, state, scales, lambda state, count: control_step(step, state, count, dt))
+    return parts.run(advance, state, scales, lambda state, count: steps.some(count).control(state))
 
 
-def _parts_of(plan: RolloutPlan) -> tuple[Checkpoints | None, int | None, str | None]:
-    """Checkpoints, steps of a graph and the schedule that a plan was made for."""
+def _as_planned(steps: Steps, plan: RolloutPlan) -> Steps:
+    """Steps with the checkpoints, graphs and schedule that a plan was made for."""
     if not isinstance(plan, RolloutPlan):
         raise TypeError(f"plan must be a RolloutPlan or None, got {shape_of(plan)}")
     graph = plan.steps_per_call if plan.executor == "graph" else None
-    return plan.checkpoints, graph, plan.schedule if plan.forced else None
+    schedule = plan.schedule if plan.forced else None
+    return steps._replace(checkpoints=plan.checkpoints, graph=graph, schedule=schedule)
 
 
-def _taken(
-    step: Callable[[State, float | Tensor], State],
-    state: State,
-    n: int,
-    dt: float | Tensor,
-    kept: Checkpoints | None = None,
-    first: int = 0,
-    graph: int | None = None,
-    schedule: str | None = None,
-    given: RolloutPlan | None = None,
-) -> State:
-    """The state n steps later, by the plan of these steps. `first` is the index of the first one in the rollout. The
-    executor of a given plan must be that of the plan of these steps."""
+def _computed(steps: Steps, state: State, given: RolloutPlan | None = None) -> State:
+    """The state after the steps, by their plan. The executor of a given plan must be that of the plan of the steps."""
+    step = steps.step
     if isinstance(step, Step):
-        state = step.with_residual(state, dt)
-    plan = plan_of_steps(step, state, n, dt, kept, graph, schedule)
+        state = step.with_residual(state, steps.dt)
+    plan = plan_of_steps(steps, state)
     if given is not None and given.executor != plan.executor:
         reason = plan.reasons.get(given.executor, "another executor computes them")
         raise ValueError(f"plan must be one for these steps, got the executor {given.executor!r}: {reason}")
     if plan.executor == "fused":
-        return in_calls(step, state, n, dt, plan)  # type: ignore[arg-type]
+        return in_calls(steps, state, plan)
     if plan.executor == "replay":
-        return replayed(step, state, n, dt)  # type: ignore[arg-type]
-    return _from_python(step, state, n, dt, plan, first)
+        return replayed(steps, state)
+    return _from_python(steps, state, plan)
 
 
-def _from_python(
-    step: Callable[[State, float | Tensor], State],
-    state: State,
-    n: int,
-    dt: float | Tensor,
-    plan: RolloutPlan,
-    first: int,
-) -> State:
-    """`_taken` by single steps, or by graphs of some."""
+def _from_python(steps: Steps, state: State, plan: RolloutPlan) -> State:
+    """`_computed` by single steps, or by graphs of some."""
+    step, n = steps.step, steps.n
     grid = step.grid if isinstance(step, Step) else None
     kept = None if plan.stores_all else plan.checkpoints
 
     def single(state: State, count: int, begins: int) -> State:
         if plan.executor == "graph":
-            return graphed_steps(step, state, count, dt, plan.steps_per_call)  # type: ignore[arg-type]
-        for k in range(first + begins, first + begins + count):
+            return graphed_steps(steps.some(count, begins), state, plan.steps_per_call)
+        for k in range(begins, begins + count):
             mark = begin() if detecting() else None
-            before, state = state, step(state, dt)
+            before, state = state, step(state, steps.dt)
             if mark is not None:
-                watch(before, state, mark, k, grid)
+                watch(before, state, mark, steps.first + k, grid)
         return state
 
     if kept is not None and n > 0 and _begins_to_keep(step):
-        state, first, n = single(state, 1, 0), first + 1, n - 1
+        state, steps, n = single(state, 1, 0), steps.some(n - 1, 1), n - 1
     if kept is None or n == 0:
         return single(state, n, 0)
     if isinstance(step, Step):

@@ -20,6 +20,7 @@ from .graph_replay import CHUNK, replay_all
 from .plan import RolloutPlan, facts_of, follows_paths, plan_call, plan_of_steps
 from .run import rollout
 from .sorting import restore_order, sort_particles
+from .steps import Steps
 
 SEGMENT = 16
 """Substeps between two choices of dt."""
@@ -108,7 +109,7 @@ def rollout_to(
     check_count("every", every, 1)
     check_count("most", most, 1)
     given = _compensated(step, step.prepare(state), cfl, longest)
-    unsorted = plan_call(None, facts_of(step, given, 1, 1.0)._replace(steps=most)).order > 0
+    unsorted = plan_call(None, facts_of(Steps(step, 1, 1.0), given)._replace(steps=most)).order > 0
     start = sort_particles(step, given) if unsorted else given
     clocks = Clocks(step, start, time, cfl, longest, most, previous)
     with control_step(step, start, most, PACE, clocks.seconds) as left:
@@ -178,7 +179,7 @@ class Clocks:
 
         def segment(state: State) -> State:
             state, dt = self._next(state, n)
-            return in_calls(self.step, state, n, dt, plan)
+            return in_calls(Steps(self.step, n, dt), state, plan)
 
         # The first one allocates the records of steps.
         self.state = replay_all(self.step, segment, segment(self.state), segments - 1, max(CHUNK // n, 1))
@@ -197,7 +198,7 @@ class Clocks:
         step, state = self.step, self.state
         if not state.x.is_cuda or follows_paths(step):
             return None
-        plan = plan_of_steps(step, state, n, self._dt.to(state.x.dtype))
+        plan = plan_of_steps(Steps(step, n, self._dt.to(state.x.dtype)), state)
         if plan.executor != "fused" or plan.facts is None or plan.facts.gradients:
             return None
         return plan.of_sorted()  # or not worth a sort

@@ -1,0 +1,38 @@
+"""Steps of a rollout as one value, which is planned, divided and computed."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from torch import Tensor
+
+from ..boundaries.control import Leave, control_step
+from ..state.state import State
+from .checkpoints import Checkpoints
+
+
+class Steps(NamedTuple):
+    """n steps of dt [s], and how they are launched and stored for a backward pass."""
+
+    step: Callable[[State, float | Tensor], State]
+    """A `Step`, or any function (state, dt) -> state."""
+    n: int
+    dt: float | Tensor
+    checkpoints: Checkpoints | None = None
+    graph: int | None = None
+    """Number of steps per CUDA graph, see `rollout`."""
+    schedule: str | None = None
+    """Forced schedule of the fused op; None for the fastest one."""
+    first: int = 0
+    """Index of the first step in the rollout."""
+
+    def some(self, n: int, first: int = 0) -> Steps:
+        """n of these steps, after `first` others."""
+        return Steps(self.step, n, self.dt, self.checkpoints, self.graph, self.schedule, self.first + first)
+
+    def control(self, state: State) -> contextlib.AbstractContextManager[Leave]:
+        """Context in which obstacles move as they do in these steps."""
+        step: Any = self.step
+        return control_step(step, state, self.n, self.dt)
