@@ -17,7 +17,8 @@ import h5py
 from torch_mpm import Trajectory
 from torch_mpm.cli import main
 from torch_mpm.data.whole_files import write_record
-from torch_mpm.scene import Scene, checkpoint
+from torch_mpm.scene import Scene
+from torch_mpm.state import state_file
 from torch_mpm.scene.folder import read_run
 from torch_mpm.scene.run import Interrupted
 
@@ -84,13 +85,13 @@ def test_a_full_disk_ends_with_its_message(scene, tmp_path, size):
 def test_a_checkpoint_that_does_not_fit_leaves_the_one_before(tmp_path):
     path = tmp_path / "checkpoint.h5"
     state = Scene(**disc()).build("cpu").state
-    checkpoint.save(path, checkpoint.tensors_of(state), {"time": 1.0})
+    state_file.save(path, state_file.tensors_of(state), {"time": 1.0})
     before = path.read_bytes()
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) // 2, hard))
     try:
         with pytest.raises(OSError, match="File too large"):
-            checkpoint.save(path, checkpoint.tensors_of(state), {"time": 2.0})
+            state_file.save(path, state_file.tensors_of(state), {"time": 2.0})
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert path.read_bytes() == before and [p.name for p in tmp_path.iterdir()] == [path.name]
