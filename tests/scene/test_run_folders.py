@@ -18,9 +18,9 @@ from torch_mpm import Trajectory
 from torch_mpm.cli import main
 from torch_mpm.data.whole_files import write_record
 from torch_mpm.scene import Scene
-from torch_mpm.state import state_file
 from torch_mpm.scene.folder import read_run
 from torch_mpm.scene.run import Interrupted
+from torch_mpm.state import state_file
 
 FILES = ("run.json", "checkpoint.h5", "trajectory.partial.h5")
 DAMAGE = {

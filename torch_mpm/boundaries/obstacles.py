@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch
 from torch import Tensor
 
-from ..cuda_graphs.capture import GraphCache
+from ..cuda_graphs.capture import DeviceConstantCache
 from ..errors import check_count, check_number, shape_of
 from ..geometry import shapes
 from ..geometry.per_scene import Value, finite, per_node
@@ -126,7 +126,7 @@ class Obstacle(RigidMotion):
         super().__init__(position, velocity, rotation, angular_velocity, start)
         self.shape, self.kind, self.friction = shape, kind, friction
         self.end, self.scene = float(end), scene
-        self.kept_table = GraphCache()
+        self.kept_table = DeviceConstantCache()
         """Kept by `torch_mpm.ops.obstacle_tables` for a list of obstacles that begins with this one."""
         self.identify()
         self.placements = 0

@@ -183,7 +183,7 @@ def is_same(known: Any, value: Any) -> bool:
     return same_length and all(is_same(a, b) for a, b in zip(known, value, strict=True))
 
 
-class GraphCache:
+class DeviceConstantCache:
     """Latest value by key: tensors on the device, computed without waiting for it. A value is recomputed when the key
     changes, or the contents of its lists, arrays and tensors (see `Remembered`).
 

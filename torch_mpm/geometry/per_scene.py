@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from ..cuda_graphs.capture import GraphCache
+from ..cuda_graphs.capture import DeviceConstantCache
 from ..errors import check_number, shape_of
 from ..laws.parameters import TensorModule
 
@@ -19,7 +19,7 @@ Value = float | Sequence[float] | Tensor
 class SceneParameters(TensorModule):
     """Module whose parameters are numbers or tensors, one for all scenes or one per scene."""
 
-    _constants: dict[tuple[str, torch.device, torch.dtype], GraphCache]
+    _constants: dict[tuple[str, torch.device, torch.dtype], DeviceConstantCache]
 
     RANKS: ClassVar[dict[str, int | None]] = {}
     """Number of dimensions of a value of each parameter that may be given per scene; None for that of an angle."""
@@ -82,7 +82,7 @@ class SceneParameters(TensorModule):
             raise TypeError(f"{name} must be numbers or one tensor, got tensors in a list: stack them (torch.stack)")
         if torch.compiler.is_compiling() or type(like) not in (Tensor, torch.nn.Parameter):
             return filled(value, like)
-        kept = self._constants.setdefault((name, like.device, like.dtype), GraphCache())
+        kept = self._constants.setdefault((name, like.device, like.dtype), DeviceConstantCache())
         result: Tensor = kept.get((value,), lambda: filled(value, like), like)
         return result
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from ..cuda_graphs.capture import GraphCache, is_traced
+from ..cuda_graphs.capture import DeviceConstantCache, is_traced
 from ..errors import check_number, shape_of
 from ..geometry.vectors import product
 from ..ops.arguments import refuse_batched, soa_empty
@@ -44,7 +44,7 @@ PLASTIC_VOLUME = "log_plastic_volume"
 """History of laws whose plastic flow changes the volume: ln J_p."""
 ARGUMENTS = {"eta": "viscosity"}
 """Names of arguments that are stored under another name."""
-_NO_VALUES = frozenset({type(value) for value in vars(nn.Module()).values()} | {GraphCache, str})
+_NO_VALUES = frozenset({type(value) for value in vars(nn.Module()).values()} | {DeviceConstantCache, str})
 """Types of attributes that are no parameters, such as those that every module has."""
 FIGURES = ("stress", "stiffness", "energy_density")
 """Values of a law that a survey needs."""
@@ -69,7 +69,7 @@ class CompiledLaw(Material):
 
     def __init__(self) -> None:
         super().__init__()
-        self._kept_parameters, self._kept_scalars = GraphCache(), GraphCache()
+        self._kept_parameters, self._kept_scalars = DeviceConstantCache(), DeviceConstantCache()
         self._functions = False
 
     def __setattr__(self, name: str, value: Any) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from ..cuda_graphs.capture import GraphCache, is_traced
+from ..cuda_graphs.capture import DeviceConstantCache, is_traced
 from ..errors import check_numbers, check_real, shape_of
 from ..ops.arguments import per_parameter
 
@@ -67,7 +67,7 @@ class Table(nn.Module):
                 f"got {shape_of(knots)} and {shape_of(values)}"
             )
         check_knots("temperature of a table", knots, "value of a table", values)
-        self._kept = GraphCache()
+        self._kept = DeviceConstantCache()
         store(self, "temperature", knots)
         store(self, "value", values)
 

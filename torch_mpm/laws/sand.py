@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from ..cuda_graphs.capture import GraphCache
+from ..cuda_graphs.capture import DeviceConstantCache
 from ..errors import check_flag, check_number
 from ..ops.arguments import per_parameter
 from ..ops.law import DISSIPATED, MULTIPLIER
@@ -96,7 +96,7 @@ class QuarticSand(SolidLaw):
         self.extra_fields = tuple(
             name for name, used in ((VOLUME, volume_correction), (HARDENING, hardening is not None)) if used
         )
-        self._kept_slope = GraphCache()
+        self._kept_slope = DeviceConstantCache()
 
     def _set_friction(self, angle: Value | None, hardening: Sequence[Value] | None) -> None:
         expected: tuple[str, Callable[[Any], Any]] = (ANGLE, lambda v: (v >= 0) & (v < math.pi / 2))

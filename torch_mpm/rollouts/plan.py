@@ -14,7 +14,15 @@ from torch import Tensor, nn
 from .._library import graph_loops
 from ..boundaries import Obstacle
 from ..boundaries.obstacles import motion_tensors
-from ..cuda_graphs.capture import NUMBERS, GraphCache, Recordings, is_captured, is_of_library, is_traced, is_transformed
+from ..cuda_graphs.capture import (
+    NUMBERS,
+    DeviceConstantCache,
+    Recordings,
+    is_captured,
+    is_of_library,
+    is_traced,
+    is_transformed,
+)
 from ..cuda_graphs.graph import tensors_of
 from ..errors import check_count, shape_of
 from ..grid.grid import Grid
@@ -369,7 +377,7 @@ def _why_not_graphs(steps: Steps, state: State) -> str | None:
     return "there are no particles" if len(state) == 0 else None
 
 
-_OWN = (GraphCache, Recordings, ActivationRecord, Grid)
+_OWN = (DeviceConstantCache, Recordings, ActivationRecord, Grid)
 """Made for graphs."""
 
 

@@ -19,7 +19,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ..cuda_graphs.capture import GraphCache
+from ..cuda_graphs.capture import DeviceConstantCache
 from ..errors import check_number, check_vector, shape_of
 from ..laws.parameters import TensorModule
 from ..ops.arguments import per_particle
@@ -195,7 +195,7 @@ class _Numbers:
     """A `Vector` at the time of a state; numbers are copied to a device once."""
 
     def __init__(self) -> None:
-        self._kept = GraphCache()
+        self._kept = DeviceConstantCache()
 
     def at(self, name: str, value: Any, state: State) -> Tensor:
         """[D] or [P, D]"""

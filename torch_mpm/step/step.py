@@ -14,7 +14,7 @@ from ..boundaries import BoundaryList, Obstacle, Walls
 from ..boundaries.apply import after_boundaries
 from ..boundaries.control import control_step, motions_now
 from ..boundaries.impulses import Impulses, check_impulse, impulses_of, no_impulse
-from ..cuda_graphs.capture import GraphCache, is_captured, is_traced, is_transformed
+from ..cuda_graphs.capture import DeviceConstantCache, is_captured, is_traced, is_transformed
 from ..errors import REAL, PrecisionWarning, check_flag, check_number, check_vector, is_finite, shape_of
 from ..grid import resolution
 from ..grid.grid import Blocks, Grid, check_grid
@@ -139,7 +139,7 @@ class Step(TensorModule):
         self.integrator = integrator  # type: ignore[assignment]
         self.compensated = compensated
         self._activations = ActivationRecord()
-        self._kept_gravity = GraphCache()
+        self._kept_gravity = DeviceConstantCache()
         locking.warn(self.law, self.grid.kernel, devices=False)
 
     def __setattr__(self, name: str, value: Any) -> None:
