@@ -5,13 +5,14 @@ from typing import TYPE_CHECKING, Any
 
 from . import _library as _library
 from . import _moved, laws, ops
-from .boundaries import SDF, Box, Capsule, Plane, Revolved, Sphere, Walls, Waypoints
+from .boundaries import SDF, Box, Capsule, Obstacle, Plane, Revolved, Sphere, Walls, Waypoints
 from .data.trajectory import Trajectory
 from .errors import DamagedFileError, FrontWarning, GridOverflowError, LockingWarning, PrecisionWarning, SimulationError
-from .geometry import seed
+from .geometry import seed, shapes
 from .grid.grid import Blocks, Grid
 from .heat import Heat
 from .heat import boundaries as heat_boundaries
+from .implicit import Implicit
 from .laws import *  # noqa: F403
 from .laws.parameters import PerMaterial, Table
 from .ops import (
@@ -64,6 +65,8 @@ __all__ = [
     "LockingWarning",
     "Heat",
     "HeatSolve",
+    "Implicit",
+    "Obstacle",
     "PerMaterial",
     "Plane",
     "PrecisionWarning",
@@ -100,6 +103,7 @@ __all__ = [
     "rollout_to",
     "scatter",
     "seed",
+    "shapes",
     "stable_dt",
     "substeps_arguments",
     "svd3",

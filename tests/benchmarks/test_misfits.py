@@ -14,10 +14,10 @@ from benchmarks.fuzz import calls, misfits, public
 
 RESULTS = (
     "Blocks", "DamagedFileError", "Failures", "Frames", "GridOverflowError", "HeatSolve", "Material",
-    "FrontWarning", "LockingWarning", "PrecisionWarning", "RolloutEstimate", "RolloutPlan", "RolloutToResult",
-    "SimulationError", "Trajectory",
+    "FrontWarning", "LockingWarning", "Obstacle", "PrecisionWarning", "RolloutEstimate", "RolloutPlan",
+    "RolloutToResult", "SimulationError", "Trajectory",
 )  # fmt: skip
-"""Classes that functions return or raise, and a base class."""
+"""Classes that functions return or raise, and base classes."""
 CUDA_ALONE = ("captured", "make_graphed_step")
 
 PROGRAM = """
