@@ -92,7 +92,7 @@ def test_a_run_that_is_resumed_removes_what_a_kill_has_left(tmp_path, monkeypatc
 
 
 def test_files_of_a_run_are_those_of_a_process_while_they_are_written(tmp_path, monkeypatch):
-    """So that another process can tell whether the writer is alive."""
+    """So that another process can detect whether the writer is alive."""
     pytest.importorskip("pydantic")
     words, seen, fsync = scene_command(tmp_path, "run", "seed=1"), [], os.fsync
     monkeypatch.setattr("torch_mpm.scene.writer.CHECKPOINT_SECONDS", 0.0)

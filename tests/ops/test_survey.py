@@ -96,7 +96,7 @@ def test_no_mass_and_huge_numbers(device):
 
 
 def test_moving_obstacles_near_particles_count(device):
-    """A sphere and a plane, whose distances are exact: as `Obstacle.speed` says."""
+    """A sphere and a plane, whose distances are exact: the speeds are those of `Obstacle.speed`."""
     given, box = particles(3, 2, device), grid(3, 2)
     obstacles = [
         mpm.Sphere((0.5, 0.5, 0.5), 0.1, velocity=(40.0, 0.0, 0.0), angular_velocity=(0.0, 0.0, 30.0)),
