@@ -447,6 +447,8 @@ def test_the_command_line(whole, tmp_path, capsys):
     record_path(shard_path(tmp_path / "set", 2)).unlink()
     assert main(["finalize", str(tmp_path / "set")]) == 1 and main(["verify", str(tmp_path / "set")]) == 1
     assert "lacks 1 of 4 shards (shard_00002)" in capsys.readouterr().err
+    assert main(["generate", str(tmp_path / "set.toml"), "-o", str(tmp_path / "set"), "--device", "cpu"]) == 0
+    assert "5 scenes of earlier calls or other processes were not read" in capsys.readouterr().out
     assert main(["generate", "-o", str(tmp_path / "other")]) == 1
     assert "takes a configuration or --preset" in capsys.readouterr().err
     assert (os.environ.get("RANK") is None) and (tmp_path / "set" / "config.toml").read_text() == json_to_toml()

@@ -131,6 +131,9 @@ def _generate(options: argparse.Namespace) -> None:
     scenes = dataset.attempted()
     print("".join(f"{line}\n" for line in reasons(scenes)), end="")
     check_failures(scenes, options.most_failed)
+    others = len(scenes) - done["scenes"]
+    if others > 0 and not options.check:
+        print(f"{others} scenes of earlier calls or other processes were not read: --check and torch-mpm verify do")
     rest = f"complete; torch-mpm finalize {options.out} writes its metadata"
     print(f"{options.out} is {rest if done['complete'] else 'not complete: other processes work in it, or are to'}")
 
