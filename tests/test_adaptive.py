@@ -8,15 +8,12 @@ from helpers import TOLERANCE
 from torch import Tensor
 
 import torch_mpm as mpm
+from benchmarks.catalogue.scenes import unit_box
 
 F64 = torch.float64
 END = 0.06
 STIFFNESS = (1e3, 3e4, 2e5)
 """Young's moduli of three scenes [Pa]; the last needs about 14 times the substeps of the first."""
-
-
-def box(dim: int, **options) -> mpm.Grid:
-    return mpm.Grid(dx=0.0625, lower=(0.0,) * dim, upper=(1.0,) * dim, **options)
 
 
 def blob(device: str, dim: int, dtype: torch.dtype, count: int = 60) -> mpm.State:
@@ -37,7 +34,7 @@ def step_of(dim: int, E, scenes: int = 1, device: str = "cpu", dtype: torch.dtyp
     E = torch.tensor(E, dtype=dtype, device=device) if isinstance(E, tuple) else E
     gravity = options.pop("gravity", (0.0, -9.8, 0.0)[:dim])
     law = options.pop("law", mpm.NeoHookean)(E=E, nu=0.3)
-    return mpm.Step(box(dim, scenes=scenes), law, gravity=gravity, walls="separate", **options)
+    return mpm.Step(unit_box(dim, scenes=scenes), law, gravity=gravity, walls="separate", **options)
 
 
 def one_by_one(step: mpm.Step, state: mpm.State, end: float, cfl: float, every: int) -> tuple[mpm.State, int]:
@@ -108,12 +105,12 @@ def test_a_scene_does_not_depend_on_the_scenes_beside_it(kind, limits, device):
     times = torch.tensor([0.0, 0.02, 0.01], dtype=F64), torch.tensor([0.05, 0.03, 0.06], dtype=F64)
     start, end = (t.to(device) for t in times)
     step = step_of(2, STIFFNESS, scenes=3, device=device, **KINDS[kind])
-    step.grid = box(2, scenes=3, deterministic=True)
+    step.grid = unit_box(2, scenes=3, deterministic=True)
     with torch.no_grad():
         together = mpm.rollout_to(step, batch(device, 2).replace(time=start), end, **limits)
         for k, E in enumerate(STIFFNESS):
             alone = step_of(2, (E,), device=device, **KINDS[kind])
-            alone.grid = box(2, deterministic=True)
+            alone.grid = unit_box(2, deterministic=True)
             state = blob(device, 2, F64).replace(time=start[k : k + 1])
             expected = mpm.rollout_to(alone, state, end[k : k + 1], **limits)
             assert together.substeps[k] == expected.substeps[0]
@@ -128,7 +125,7 @@ def test_a_scene_does_not_depend_on_the_scenes_beside_it(kind, limits, device):
 def test_gradients_of_a_scene_do_not_depend_on_the_scenes_beside_it(device):
     def gradient(E: tuple[float, ...]) -> Tensor:
         step = step_of(2, E, scenes=len(E), device=device)
-        step.grid = box(2, scenes=len(E), deterministic=True)
+        step.grid = unit_box(2, scenes=len(E), deterministic=True)
         state = mpm.State.concatenate([blob(device, 2, F64, count=12)] * len(E), scene=True)
         v = state.v.clone().requires_grad_()
         arrival = mpm.rollout_to(step, state.replace(v=v), END, every=4)

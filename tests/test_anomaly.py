@@ -4,9 +4,9 @@ import re
 
 import pytest
 import torch
-from cases.steps import block_state, make_step
 
 import torch_mpm as mpm
+from benchmarks.catalogue.scenes import block_state, make_step
 
 DT = 1e-3
 pytestmark = pytest.mark.filterwarnings("ignore:Anomaly Detection", "ignore:Error detected")

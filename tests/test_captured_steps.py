@@ -12,10 +12,11 @@ import weakref
 import pytest
 import torch
 from cases.networks import network
-from cases.rollouts import F64, assert_equal, blob, box, one_by_one
+from cases.rollouts import F64, assert_equal, one_by_one
 from torch import nn
 
 import torch_mpm as mpm
+from benchmarks.catalogue.scenes import blob, unit_box
 from torch_mpm.cuda_graphs.capture import Recordings
 from torch_mpm.rollouts import graph_segments
 from torch_mpm.step.status import uncounted
@@ -99,17 +100,21 @@ class Control(nn.Module):
 
 
 def learned(device):
-    return mpm.Step(box(2, deterministic=True), network(2, device), gravity=(0.0, -9.8), walls="slip"), blob(device, 2)
+    return mpm.Step(unit_box(2, deterministic=True), network(2, device), gravity=(0.0, -9.8), walls="slip"), blob(
+        device, 2
+    )
 
 
 def blown(device):
     law = mpm.NeoHookean(E=torch.tensor(1e4, dtype=F64, device=device, requires_grad=True), nu=0.3)
-    return mpm.Step(box(2, deterministic=True), law, on_grid=Wind().double()).to(device), blob(device, 2)
+    return mpm.Step(unit_box(2, deterministic=True), law, on_grid=Wind().double()).to(device), blob(device, 2)
 
 
 def driven(device):
     ball = mpm.Sphere((0.5, 0.2), 0.15, velocity=(0.0, 4.0))
-    step = mpm.Step(box(2, deterministic=True), network(2, device), on_particles=Control().double(), boundaries=[ball])
+    step = mpm.Step(
+        unit_box(2, deterministic=True), network(2, device), on_particles=Control().double(), boundaries=[ball]
+    )
     return step.to(device), blob(device, 2).replace(time=0.01)
 
 
@@ -122,13 +127,13 @@ def remembering(device):
 
     custom = mpm.laws.CustomLaw(law, history={"strength": ()})
     ball = mpm.Sphere((0.5, 0.5), 0.15, friction=0.2)
-    step = mpm.Step(box(2, deterministic=True), custom, walls="separate", flip=0.6, boundaries=[ball])
+    step = mpm.Step(unit_box(2, deterministic=True), custom, walls="separate", flip=0.6, boundaries=[ball])
     return step, step.with_impulses(blob(device, 2))
 
 
 def warm(device):
     """No function of the user's, but two gradients of heat."""
-    grid = box(2, deterministic=True)
+    grid = unit_box(2, deterministic=True)
     conductivity = torch.tensor(5.0, dtype=F64, requires_grad=True)
     plate = mpm.heat_boundaries.Convection(mpm.heat_boundaries.FreeSurface(), coefficient=30.0, ambient=400.0)
     heat = mpm.Heat(grid, conductivity=conductivity, specific_heat=800.0, boundaries=[plate], tolerance=1e-13)
@@ -141,7 +146,7 @@ def warm(device):
 def mixed(device):
     laws = mpm.Mixture([mpm.laws.CustomLaw(network(2, device)), mpm.NeoHookean(E=1e4, nu=0.3)])
     state = blob(device, 2, material=torch.arange(300, dtype=torch.int32) % 2)
-    return mpm.Step(box(2, deterministic=True), laws, transfer="pic"), state
+    return mpm.Step(unit_box(2, deterministic=True), laws, transfer="pic"), state
 
 
 def energetic(device):
@@ -153,7 +158,7 @@ def energetic(device):
 
     state = blob(device, 2)
     F = 0.05 * torch.randn(300, 2, 2, dtype=F64, generator=torch.Generator().manual_seed(1))
-    step = mpm.Step(box(2, deterministic=True), law, gravity=torch.tensor([0.0, -9.8], dtype=F64).requires_grad_())
+    step = mpm.Step(unit_box(2, deterministic=True), law, gravity=torch.tensor([0.0, -9.8], dtype=F64).requires_grad_())
     return step.to(device), state.replace(F=F.to(device) + torch.eye(2, dtype=F64, device=device))
 
 
@@ -214,7 +219,7 @@ def test_assigned_poses(wanted, device, recorded):
     """Obstacles move to them as in single steps, with gradients by poses; these need no other recording."""
     home = torch.tensor([0.5, 0.2], dtype=F64, device=device)
     ball = mpm.Sphere(home, 0.15, "sticky")
-    step = mpm.Step(box(2, deterministic=True), network(2, device), boundaries=[ball]).to(device)
+    step = mpm.Step(unit_box(2, deterministic=True), network(2, device), boundaries=[ball]).to(device)
     before = mpm.rollout(step, blob(device, 2), 4, DT)
     for k in range(3):
         found = []
@@ -367,7 +372,7 @@ def test_materials_and_order_by_content(device, recorded):
             assert len(recorded) == made and end.material is material
     stiff = torch.linspace(1e3, 1e4, 300, dtype=F64, device=device)
     step, again = (
-        mpm.Step(box(2, deterministic=True), mpm.NeoHookean(E=stiff, nu=0.3), on_grid=lambda b, v, m, dt: 0.99 * v)
+        mpm.Step(unit_box(2, deterministic=True), mpm.NeoHookean(E=stiff, nu=0.3), on_grid=lambda b, v, m, dt: 0.99 * v)
         for _ in range(2)
     )
     state = blob(device, 2)
@@ -416,7 +421,7 @@ def test_under_autocast_and_without_gradients_for_good(device, recorded):
     step, state = step.float(), state.to(dtype=torch.float32)
     with torch.inference_mode():
         mpm.rollout(step, state, 2, DT, graph=2)
-    again = mpm.Step(box(2, deterministic=True), step.law, transfer="pic")
+    again = mpm.Step(unit_box(2, deterministic=True), step.law, transfer="pic")
     plain, expected_plain = (trained(s, state, 4, take) for s, take in ((step, in_graphs_of(2)), (again, one_by_one)))
     with torch.autocast(device, torch.bfloat16):
         half, expected = (trained(s, state, 4, take) for s, take in ((step, in_graphs_of(2)), (again, one_by_one)))
@@ -434,7 +439,7 @@ def test_the_pool_follows_the_scene(device, recorded):
     found = []
     for take in (in_graphs_of(8), one_by_one):
         step, state = learned(device)
-        step.walls, step.grid = None, box(2, 0.02, deterministic=True)
+        step.walls, step.grid = None, unit_box(2, 0.02, deterministic=True)
         first = step(state.replace(x=0.5 + 0.3 * (state.x - 0.5)), DT).detach()
         first = first.replace(v=70 * (first.x - 0.5))
         before = step.grid.max_blocks
@@ -484,7 +489,7 @@ def test_what_is_assigned_is_recorded_anew(what, device, recorded):
         law = OwnLaw(E=1e4, nu=0.3)
         walls = mpm.Walls("slip", lower=(0.4, 0.0), upper=(1.0, 1.0))
         options = {"walls": walls, "boundaries": [ball], "on_grid": Target(device)}
-        return OwnStep(box(2, deterministic=True), law, (0.0, -9.8), **options)
+        return OwnStep(unit_box(2, deterministic=True), law, (0.0, -9.8), **options)
 
     step, again, state = make(), make(), blob(device, 2)
     with torch.no_grad():
@@ -557,7 +562,7 @@ def test_gradients_that_would_be_lost_are_refused(device, recorded):
     weight = torch.ones((), dtype=F64, device=device, requires_grad=True)
     state = blob(device, 2)
     for used in (weight, 2 * weight):
-        step = mpm.Step(box(2), mpm.NeoHookean(E=1e4, nu=0.3), on_grid=lambda b, v, m, dt, w=used: v * w)
+        step = mpm.Step(unit_box(2), mpm.NeoHookean(E=1e4, nu=0.3), on_grid=lambda b, v, m, dt, w=used: v * w)
         with pytest.raises(ValueError, match=r"must be a parameter or buffer of the step .* got one of shape \[\]"):
             mpm.rollout(step, state, 4, DT, graph=2)
         with torch.no_grad():  # where there is none to lose
@@ -591,7 +596,7 @@ def test_obstacles(device, recorded):
     assert why(step, state, torch.tensor(DT, device=device)) == "dt is a tensor"
     with torch.autograd.detect_anomaly():
         assert "anomaly" in why(step, state, DT)
-    slow = mpm.Step(box(2), mpm.NeoHookean(E=1e4, nu=0.3), integrator="implicit")
+    slow = mpm.Step(unit_box(2), mpm.NeoHookean(E=1e4, nu=0.3), integrator="implicit")
     assert why(slow, state, DT) == "an implicit step waits for its solve"
     hot = warm(device)[0]
     hot.heat.method = "multigrid"

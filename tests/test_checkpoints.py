@@ -4,13 +4,13 @@ import math
 
 import pytest
 import torch
-from cases.steps import block_state, make_step
 from helpers import relative_error
 from torch import nn
 from torch.utils.checkpoint import checkpoint as torch_checkpoint
 
 import torch_mpm as mpm
 from benchmarks.catalogue.laws import LAWS
+from benchmarks.catalogue.scenes import block, block_state, make_step
 from benchmarks.speed import checkpoints as study
 from benchmarks.speed import memory
 from torch_mpm.implicit import Implicit
@@ -316,8 +316,7 @@ def test_an_estimate_of_a_rollout_in_one_op_is_what_the_allocator_gives(kept, de
 def test_compiled_steps_that_were_never_called(kept, law, device):
     """Objects that a step creates and caches at its first call are no part of the recomputation."""
     grid = mpm.Grid(dx=0.1, lower=(0.0, 0.0), upper=(1.0, 1.0), max_blocks=25)
-    points = mpm.seed.box((0.3, 0.3), (0.5, 0.5), grid, per_cell=4)
-    state = mpm.State.at_rest(points, dtype=torch.float64, velocity=(3.0, 1.0)).to(device)
+    state = block((0.3, 0.3), (0.5, 0.5), grid, velocity=(3.0, 1.0), device=device)
 
     def gradient(compiled: bool, kept):
         step = mpm.Step(grid, LAWS[law](), gravity=(0.0, -9.8))

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 import torch_mpm as mpm
+from benchmarks.catalogue.scenes import block
 
 F32, F64 = torch.float32, torch.float64
 START, DT, STEPS = 1000.0, 1e-4, 9
@@ -27,8 +28,7 @@ def step_of(scenes: int, **options) -> mpm.Step:
 
 
 def state_of(scenes: int, dtype: torch.dtype, device: str) -> mpm.State:
-    points = mpm.seed.box((0.3, 0.3), (0.7, 0.7), grid(1), per_cell=4)
-    body = mpm.State.at_rest(points, dtype=F64, velocity=(1.0, 0.0))
+    body = block((0.3, 0.3), (0.7, 0.7), grid(1), velocity=(1.0, 0.0))
     return mpm.State.concatenate([body] * scenes, scene=True).to(device, dtype).replace(time=START)
 
 

@@ -4,11 +4,11 @@ import io
 
 import pytest
 import torch
-from cases.steps import block_state, make_step
 from torch.utils import _pytree
 from torch.utils.data import DataLoader, Dataset
 
 import torch_mpm as mpm
+from benchmarks.catalogue.scenes import block_state, make_step
 from torch_mpm.state.pytree import from_tensordict, to_tensordict
 
 

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 import torch_mpm as mpm
+from benchmarks.catalogue.scenes import block
 from torch_mpm.step import particle_operations
 
 F64 = torch.float64
@@ -14,8 +15,7 @@ DT, N = 1e-3, 8
 
 def one(k: int, device: str = "cpu", **options) -> mpm.State:
     """A block of its own size and throw."""
-    points = mpm.seed.box((0.2, 0.3), (0.4 + 0.05 * k, 0.5), 0.1, per_cell=4)
-    return mpm.State.at_rest(points, 1000.0, (1.0 - k, 0.5 * k), dtype=F64, device=device, **options)
+    return block((0.2, 0.3), (0.4 + 0.05 * k, 0.5), 0.1, velocity=(1.0 - k, 0.5 * k), device=device, **options)
 
 
 def step_of(scenes: int, device: str = "cpu", law: mpm.Material | None = None, **options) -> mpm.Step:

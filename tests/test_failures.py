@@ -9,6 +9,7 @@ from helpers import random_particles
 from oracle import advance, transfer
 
 import torch_mpm as mpm
+from benchmarks.catalogue.scenes import block
 
 NONE = [0, 0, -1, 0, -1, 0, -1, 0]
 
@@ -307,8 +308,7 @@ def batch(scenes, device, law=None, **options):
     """Scenes of elastic blocks of 36 particles that move, in one batch; scene 0 is the same in every batch."""
     grid = mpm.Grid(0.1, (0, 0), (1, 1), scenes=scenes, max_blocks=None)
     step = mpm.Step(grid, law or mpm.NeoHookean(E=1e4, nu=0.3), gravity=(0, -9.8), walls="slip", **options)
-    points = mpm.seed.box((0.3, 0.3), (0.6, 0.6), 0.1, per_cell=4)
-    one = mpm.State.at_rest(points, velocity=(0.5, 0.1), dtype=torch.float64, device=device)
+    one = block((0.3, 0.3), (0.6, 0.6), 0.1, velocity=(0.5, 0.1), device=device)
     return step, mpm.State.concatenate([one] * scenes, scene=True)
 
 

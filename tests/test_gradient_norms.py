@@ -4,9 +4,9 @@ import math
 
 import pytest
 import torch
-from cases.steps import block_state, make_step
 
 import torch_mpm as mpm
+from benchmarks.catalogue.scenes import block_state, make_step
 
 N, DT = 8, 1e-3
 

@@ -5,15 +5,16 @@ import gc
 import pytest
 import torch
 from cases.networks import network
-from cases.rollouts import F64, LAWS_HERE, assert_equal, blob, box, one_by_one, tensors
+from cases.rollouts import F64, LAWS_HERE, assert_equal, one_by_one, tensors
 
 import torch_mpm as mpm
+from benchmarks.catalogue.scenes import blob, unit_box
 
 DT = 2e-4
 
 
 def heated(dim: int, device: str, **options) -> tuple[mpm.Step, mpm.State]:
-    grid = box(dim)
+    grid = unit_box(dim)
     plate = mpm.heat_boundaries.Convection(mpm.heat_boundaries.FreeSurface(), coefficient=30.0, ambient=400.0)
     heat = mpm.Heat(grid, conductivity=5.0, specific_heat=800.0, boundaries=[plate])
     step = mpm.Step(grid, mpm.NeoHookean(E=1e4, nu=0.3), gravity=(0.0, -9.8, 0.0)[:dim], walls="slip", heat=heat)
@@ -41,7 +42,7 @@ def mixed(dim: int, device: str) -> tuple[mpm.Step, mpm.State]:
     soft = mpm.NeoHookean(E=mpm.Table([280.0, 320.0], [2e4, 1e4]), nu=0.3)
     ball = mpm.Sphere((0.5,) * dim, 0.15, velocity=(0.0, 4.0, 0.0)[:dim])
     laws = mpm.Mixture([soft, LAWS_HERE["sand"]()])
-    step = mpm.Step(box(dim), laws, walls="mirror", transfer="apic", flip=0.7, boundaries=[ball])
+    step = mpm.Step(unit_box(dim), laws, walls="mirror", transfer="apic", flip=0.7, boundaries=[ball])
     state = blob(device, dim, material=torch.arange(300, dtype=torch.int32) % 2)
     step = step.to(device)
     return step, step.with_impulses(state.replace(temperature=300 + 40 * state.x[:, 0]))
@@ -117,7 +118,7 @@ def test_functions_of_the_users_are_called_in_every_step():
 @pytest.mark.parametrize("n", [1, 4])
 def test_training_from_graphs(dim, n):
     """Values and gradients of state and network, in every call of a loop that changes both."""
-    step = mpm.Step(box(dim, max_blocks=36), network(dim, "cuda"), gravity=(0.0, -9.8, 0.0)[:dim], walls="slip")
+    step = mpm.Step(unit_box(dim, max_blocks=36), network(dim, "cuda"), gravity=(0.0, -9.8, 0.0)[:dim], walls="slip")
     state = step.prepare(blob("cuda", dim))
     F = state.F + 0.05 * torch.randn(state.F.shape, generator=torch.Generator().manual_seed(1), dtype=F64).to(state.F)
     state = state.replace(v=state.v.clone().requires_grad_(), F=F)
@@ -141,7 +142,7 @@ def test_training_from_graphs(dim, n):
 @pytest.mark.cuda
 def test_gradients_of_calls_add_up():
     """As a loop accumulates them, and as an optimizer leaves zeros for the next ones."""
-    step = mpm.Step(box(2, max_blocks=36), network(2, "cuda"))
+    step = mpm.Step(unit_box(2, max_blocks=36), network(2, "cuda"))
     state = step.prepare(blob("cuda", 2))
     start = state.replace(F=state.F + 0.05 * torch.ones_like(state.F), v=state.v.clone().requires_grad_())
     advance = mpm.make_graphed_step(step, start, DT, 2)
@@ -166,7 +167,7 @@ def test_gradients_of_calls_add_up():
 @pytest.mark.cuda
 def test_fields_by_name_and_fields_that_go():
     """Histories in another order; and PIC, whose steps give no C."""
-    step = mpm.Step(box(2, max_blocks=36), network(2, "cuda"), transfer="pic")
+    step = mpm.Step(unit_box(2, max_blocks=36), network(2, "cuda"), transfer="pic")
     state = step.prepare(blob("cuda", 2))
     a, b = torch.ones(300, device="cuda"), torch.zeros(300, device="cuda")
     state = state.replace(C=torch.zeros_like(state.F), extra={"a": a, "b": b})
@@ -185,7 +186,7 @@ def test_what_does_not_go_into_a_graph():
     law = network(2, "cuda")
     law.register_forward_hook(lambda *arguments: None)
     with pytest.raises(ValueError, match="must have no hooks"):
-        mpm.make_graphed_step(mpm.Step(box(2), law), state, DT)
+        mpm.make_graphed_step(mpm.Step(unit_box(2), law), state, DT)
 
 
 @pytest.mark.cuda
@@ -209,7 +210,7 @@ def test_rollouts_from_graphs_leave_nothing_behind():
 
 
 def test_a_graph_needs_a_gpu():
-    step = mpm.Step(box(2), mpm.NeoHookean(E=1e4, nu=0.3))
+    step = mpm.Step(unit_box(2), mpm.NeoHookean(E=1e4, nu=0.3))
     state = blob("cpu", 2)
     with pytest.raises(ValueError, match="state must be on a CUDA device, got cpu"):
         mpm.make_graphed_step(step, state, DT)

@@ -2,11 +2,12 @@
 
 import pytest
 import torch
-from cases.impulses import DT, F64, GRAVITY, LAWS, WALLS, cloud, grid_of, obstacles, one_by_one
+from cases.impulses import DT, F64, GRAVITY, LAWS, WALLS, cloud, obstacles, one_by_one
 from helpers import TOLERANCE, relative_error
 from torch import Tensor
 
 import torch_mpm as mpm
+from benchmarks.catalogue.scenes import unit_box
 
 
 def leaves(state: mpm.State, names: tuple[str, ...] = ("x", "v", "mass", "volume", "C", "F")) -> dict[str, Tensor]:
@@ -18,7 +19,9 @@ def test_gradients_of_a_rollout(device, dim, walls):
     """In one op and in single steps, against central differences."""
     gravity = torch.tensor(GRAVITY[:dim], dtype=F64, device=device, requires_grad=True)
     E = torch.tensor(1e4, dtype=F64, device=device, requires_grad=True)
-    step = mpm.Step(grid_of(dim, deterministic=True), mpm.NeoHookean(E, 0.3), gravity, WALLS[walls], obstacles(dim))
+    step = mpm.Step(
+        unit_box(dim, 0.1, deterministic=True), mpm.NeoHookean(E, 0.3), gravity, WALLS[walls], obstacles(dim)
+    )
     start = step.prepare(cloud(dim, device, count=40))
     given = leaves(start) | {"impulse": torch.randn_like(step.with_impulses(start).impulse).requires_grad_()}
     generator = torch.Generator().manual_seed(1)
@@ -57,7 +60,7 @@ def test_gradients_of_an_obstacle(device):
     def force(*parameters: Tensor) -> Tensor:
         motion = dict(zip(names[1:], parameters[1:], strict=True))
         box = mpm.Box(parameters[0], (0.37, 0.31), **motion)
-        step = mpm.Step(grid_of(2, deterministic=True), LAWS["neo_hookean"](), boundaries=[box])
+        step = mpm.Step(unit_box(2, 0.1, deterministic=True), LAWS["neo_hookean"](), boundaries=[box])
         return (weights * mpm.rollout(step, step.with_impulses(start), 3, DT).impulse).sum()
 
     parameters = [torch.tensor(v, dtype=F64, device=device, requires_grad=True) for v in values]

@@ -4,12 +4,13 @@ import math
 
 import pytest
 import torch
-from cases.impulses import DT, F64, GRAVITY, LAWS, STEPS, WALLS, cloud, grid_of, obstacles, one_by_one
+from cases.impulses import DT, F64, GRAVITY, LAWS, STEPS, WALLS, cloud, obstacles, one_by_one
 from helpers import TOLERANCE, random_blocks, random_nodes, relative_error
 from oracle import impulses as reference
 from torch import Tensor
 
 import torch_mpm as mpm
+from benchmarks.catalogue.scenes import block, unit_box
 from torch_mpm import ops
 
 TRANSFERS = {"apic": {}, "pic": {"transfer": "pic"}, "flip": {"transfer": "flip"}, "blend": {"flip": 0.7}}
@@ -66,7 +67,7 @@ def assert_balanced(step: mpm.Step, state: mpm.State, end: mpm.State, angular: b
 @pytest.mark.parametrize(("dim", "transfer"), [*((2, name) for name in TRANSFERS), (3, "apic"), (3, "blend")])
 def test_momentum_is_balanced(device, dim, walls, transfer):
     """And the one op has the impulses of single steps."""
-    grid, in_torch = grid_of(dim, scenes=2), dim == 2 and transfer in ("pic", "blend")
+    grid, in_torch = unit_box(dim, 0.1, scenes=2), dim == 2 and transfer in ("pic", "blend")
     step = mpm.Step(
         grid, LAWS["neo_hookean"](), GRAVITY[:dim], WALLS[walls], obstacles(dim, in_torch), **TRANSFERS[transfer]
     )
@@ -83,7 +84,7 @@ def test_momentum_is_balanced(device, dim, walls, transfer):
 @pytest.mark.parametrize("form", ["mls", "gradient"])
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
 def test_momentum_is_balanced_for_laws(device, kernel, law, form, dtype):
-    grid = grid_of(3, kernel=kernel)
+    grid = unit_box(3, 0.1, kernel=kernel)
     step = mpm.Step(grid, LAWS[law](), GRAVITY, WALLS["friction"], obstacles(3), stress_form=form)
     state = step.with_impulses(step.prepare(cloud(3, device, dtype=dtype)))
     end = mpm.rollout(step, state, STEPS, DT)
@@ -93,7 +94,7 @@ def test_momentum_is_balanced_for_laws(device, kernel, law, form, dtype):
 
 
 def test_steps_without_impulses_are_the_same(device):
-    step = mpm.Step(grid_of(3), LAWS["neo_hookean"](), GRAVITY, WALLS["mirror"], obstacles(3))
+    step = mpm.Step(unit_box(3, 0.1), LAWS["neo_hookean"](), GRAVITY, WALLS["mirror"], obstacles(3))
     state = step.prepare(cloud(3, device))
     counting = step.with_impulses(state)
     many = 20  # on CUDA some of them are replayed
@@ -141,7 +142,7 @@ def test_contact_impulses_are_what_nodes_lose(device, dim, per_scene):
 
 def test_a_mirror_takes_the_normal_component(device, dim):
     """Nodes exchange momentum along the wall without a sum; only the moment changes."""
-    blocks = random_blocks(grid_of(dim), device, share=1.0)
+    blocks = random_blocks(unit_box(dim, 0.1), device, share=1.0)
     nodes = random_nodes(blocks)
     walls = mpm.Walls([("mirror", "open"), *["open"] * (dim - 1)])
     found = ops.wall_impulses(blocks, nodes, walls=walls)[0]
@@ -152,9 +153,9 @@ def test_a_mirror_takes_the_normal_component(device, dim):
 
 def test_more_obstacles_than_an_op_takes(device):
     many = [mpm.Sphere((0.1 + 0.04 * k, 0.3), 0.1, kind="slip", friction=0.1) for k in range(20)]
-    blocks = random_blocks(grid_of(2), device)
+    blocks = random_blocks(unit_box(2, 0.1), device)
     nodes = random_nodes(blocks)
-    step = mpm.Step(grid_of(2), LAWS["neo_hookean"](), boundaries=many)
+    step = mpm.Step(unit_box(2, 0.1), LAWS["neo_hookean"](), boundaries=many)
     state = step.with_impulses(cloud(2, device))
     end = step(state, DT)
     assert end.impulse.shape == (1, 24, 3)
@@ -216,9 +217,9 @@ def test_friction_on_a_slope(device, friction):
 
 def test_what_pushes_a_ball_through_is_resisted(device):
     ball = mpm.Sphere((0.3, 0.4), 0.15, kind="sticky", velocity=(1.0, 0.0))
-    grid = grid_of(2)
+    grid = unit_box(2, 0.1)
     step = mpm.Step(grid, mpm.WeaklyCompressible(1e4), boundaries=[ball], walls="separate")
-    state = mpm.State.at_rest(mpm.seed.box((0.0, 0.0), (1.0, 0.8), grid, per_cell=4), dtype=F64, device=device)
+    state = block((0.0, 0.0), (1.0, 0.8), grid, device=device)
     end = mpm.rollout(step, step.with_impulses(state), 100, 5e-4)
     on = step.impulses(end)
     assert float(on[ball].linear[0, 0]) < 0  # against its motion
@@ -252,11 +253,11 @@ def test_a_held_ball_is_lifted_by_water(device):
 
 def test_nothing_to_count(device):
     """No boundaries, no particles, an empty scene."""
-    step = mpm.Step(grid_of(2, scenes=2), LAWS["neo_hookean"]())
+    step = mpm.Step(unit_box(2, 0.1, scenes=2), LAWS["neo_hookean"]())
     state = cloud(2, device, 2).select(torch.arange(0, 240, 2).to(device))
     end = mpm.rollout(step, step.with_impulses(state), 3, DT)
     assert end.impulse.shape == (2, 4, 3) and (end.impulse == 0).all()
-    step = mpm.Step(grid_of(2, scenes=2), LAWS["neo_hookean"](), GRAVITY[:2], "sticky", obstacles(2))
+    step = mpm.Step(unit_box(2, 0.1, scenes=2), LAWS["neo_hookean"](), GRAVITY[:2], "sticky", obstacles(2))
     end = mpm.rollout(step, step.with_impulses(state), 3, DT)  # scene 1 is empty
     assert (end.impulse[1] == 0).all() and (end.impulse[0] != 0).any()
     empty = state.select(torch.empty(0, dtype=torch.int64, device=device))
@@ -266,7 +267,7 @@ def test_nothing_to_count(device):
 
 def test_a_lost_scene_does_not_reach_the_others(device):
     step = mpm.Step(
-        grid_of(2, scenes=2, deterministic=True), LAWS["neo_hookean"](), GRAVITY[:2], "sticky", obstacles(2)
+        unit_box(2, 0.1, scenes=2, deterministic=True), LAWS["neo_hookean"](), GRAVITY[:2], "sticky", obstacles(2)
     )
     state = step.with_impulses(cloud(2, device, 2))
     broken = state.replace(v=torch.where((state.scene == 1)[:, None], torch.nan, state.v))
@@ -276,7 +277,7 @@ def test_a_lost_scene_does_not_reach_the_others(device):
 
 
 def test_a_paused_scene_counts_nothing(device):
-    step = mpm.Step(grid_of(2, scenes=2), LAWS["neo_hookean"](), GRAVITY[:2], "sticky", obstacles(2))
+    step = mpm.Step(unit_box(2, 0.1, scenes=2), LAWS["neo_hookean"](), GRAVITY[:2], "sticky", obstacles(2))
     state = step.with_impulses(cloud(2, device, 2))
     dt = torch.tensor([DT, 0.0], dtype=F64, device=device)
     end = one_by_one(step, state, 3, dt)
@@ -284,15 +285,17 @@ def test_a_paused_scene_counts_nothing(device):
 
 
 def test_results_have_the_same_bits_again(device):
-    step = mpm.Step(grid_of(3, deterministic=True, scenes=2), LAWS["neo_hookean"](), GRAVITY, "sticky", obstacles(3))
+    step = mpm.Step(
+        unit_box(3, 0.1, deterministic=True, scenes=2), LAWS["neo_hookean"](), GRAVITY, "sticky", obstacles(3)
+    )
     state = step.with_impulses(cloud(3, device, 2, 400))
     runs = [mpm.rollout(step, state, STEPS, DT).impulse for _ in range(3)]
     assert torch.equal(runs[0], runs[1]) and torch.equal(runs[0], runs[2])
 
 
 def test_fields_of_a_state(device):
-    step = mpm.Step(grid_of(2, scenes=2), LAWS["neo_hookean"](), boundaries=obstacles(2), walls="slip")
-    single = mpm.Step(grid_of(2), LAWS["neo_hookean"](), boundaries=obstacles(2), walls="slip")
+    step = mpm.Step(unit_box(2, 0.1, scenes=2), LAWS["neo_hookean"](), boundaries=obstacles(2), walls="slip")
+    single = mpm.Step(unit_box(2, 0.1), LAWS["neo_hookean"](), boundaries=obstacles(2), walls="slip")
     parts = [mpm.rollout(single, single.with_impulses(cloud(2, device, count=n)), 3, DT) for n in (30, 50)]
     batch = mpm.State.concatenate(parts, scene=True)
     assert torch.equal(batch.impulse, torch.cat([p.impulse for p in parts]))
@@ -310,7 +313,7 @@ def test_fields_of_a_state(device):
 def test_frames_and_control(device):
     """Impulses between frames, while a hook gives the paddle new poses; forces by boundary, number and face."""
     paddle = mpm.Box(torch.tensor([0.5, 0.4], dtype=F64, device=device), (0.3, 0.1))
-    step = mpm.Step(grid_of(2), LAWS["neo_hookean"](), GRAVITY[:2], "sticky", boundaries=[paddle])
+    step = mpm.Step(unit_box(2, 0.1), LAWS["neo_hookean"](), GRAVITY[:2], "sticky", boundaries=[paddle])
     state = step.with_impulses(cloud(2, device))
 
     def control(state: mpm.State, k: int) -> None:
@@ -331,7 +334,7 @@ def test_frames_and_control(device):
 
 
 def test_errors():
-    step = mpm.Step(grid_of(2), LAWS["neo_hookean"](), walls="slip")
+    step = mpm.Step(unit_box(2, 0.1), LAWS["neo_hookean"](), walls="slip")
     state = cloud(2)
     with pytest.raises(ValueError, match=r"state\.impulse is None"):
         step.impulses(state)

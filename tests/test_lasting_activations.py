@@ -2,10 +2,11 @@
 
 import pytest
 import torch
-from cases.rollouts import LAWS_HERE, assert_equal, blob, box, one_by_one, tensors
+from cases.rollouts import LAWS_HERE, assert_equal, one_by_one, tensors
 from combinations import F64
 
 import torch_mpm as mpm
+from benchmarks.catalogue.scenes import blob, unit_box
 
 N, DT = 24, 1e-4
 MOST_BLOCKS, ACTIVATIONS, PROBLEM, BLOCKS_NOW = 0, 5, 6, 7  # columns of the status, see csrc/grid/status.h
@@ -15,7 +16,7 @@ def flow(dim, cells, count=2000, dtype=F64, **fields):
     """Unsorted particles with a common motion of about `cells` cells per step, and a fifth of it at random."""
     state = blob("cpu", dim, count, dtype=dtype, **fields)
     along = torch.tensor([1.0, -0.7, 0.4][:dim], dtype=dtype)
-    return state.replace(v=(along + 0.2 * state.v) * (cells * box(dim).dx / DT))
+    return state.replace(v=(along + 0.2 * state.v) * (cells * unit_box(dim).dx / DT))
 
 
 @torch.no_grad()
@@ -23,7 +24,7 @@ def flow(dim, cells, count=2000, dtype=F64, **fields):
 @pytest.mark.parametrize("options", [{"transfer": "pic"}, {"transfer": "apic"}, {"stress_form": "gradient"}], ids=str)
 @pytest.mark.parametrize("cells", [0.01, 0.2])
 def test_laws_and_forms(law, options, cells, dim):
-    step = mpm.Step(box(dim), LAWS_HERE[law](), walls="separate", **options)
+    step = mpm.Step(unit_box(dim), LAWS_HERE[law](), walls="separate", **options)
     state = step.prepare(flow(dim, cells))
     assert_equal(mpm.rollout(step, state, N, DT), one_by_one(step, state, N, DT))
 
@@ -31,7 +32,7 @@ def test_laws_and_forms(law, options, cells, dim):
 @torch.no_grad()
 @pytest.mark.parametrize("n", [8, 9, 10, 11, 40])
 def test_calls_that_are_just_long_enough(n, dim):
-    step = mpm.Step(box(dim), LAWS_HERE["sand"](), walls="slip")
+    step = mpm.Step(unit_box(dim), LAWS_HERE["sand"](), walls="slip")
     state = step.prepare(flow(dim, 0.05))
     assert_equal(mpm.rollout(step, state, n, DT), one_by_one(step, state, n, DT))
 
@@ -41,7 +42,7 @@ def test_the_status_tells_of_the_last_substep(dim):
     """It has an activation of its own."""
     statuses = []
     for roll in (mpm.rollout, one_by_one):
-        step = mpm.Step(box(dim), LAWS_HERE["neo_hookean"](), walls="slip")
+        step = mpm.Step(unit_box(dim), LAWS_HERE["neo_hookean"](), walls="slip")
         roll(step, flow(dim, 0.1), N, DT)
         statuses.append(step.status)
     peaks = [int(s[0, MOST_BLOCKS]) for s in statuses]
@@ -57,7 +58,7 @@ def test_at_the_edge_of_the_lattice(walls, dim):
     """Particles come to it from all sides, and leave it where there are no walls."""
     ends = []
     for roll in (mpm.rollout, one_by_one):
-        step = mpm.Step(box(dim), LAWS_HERE["neo_hookean"](), walls=walls)
+        step = mpm.Step(unit_box(dim), LAWS_HERE["neo_hookean"](), walls=walls)
         state = blob("cpu", dim, 1500)
         state = state.replace(v=(state.x - 0.5) * (14 * step.grid.dx / (N * DT)) / 0.2)
         end = roll(step, state, N, DT)
@@ -70,7 +71,7 @@ def test_at_the_edge_of_the_lattice(walls, dim):
 @pytest.mark.parametrize("cells", [0.9, 3.0, 20.0])
 def test_a_particle_that_is_much_faster_than_the_others(cells, dim):
     """It is not missed, however far it goes in a step."""
-    step = mpm.Step(box(dim, dx=1 / 32), LAWS_HERE["neo_hookean"]())
+    step = mpm.Step(unit_box(dim, dx=1 / 32), LAWS_HERE["neo_hookean"]())
     state = flow(dim, 0.01)
     state.v[3] = cells * step.grid.dx / DT
     assert_equal(mpm.rollout(step, state, 12, DT), one_by_one(step, state, 12, DT))
@@ -96,7 +97,7 @@ def test_a_velocity_that_is_not_of_this_world(poison, dim):
     """Particles near it are lost, distant ones are unchanged, and the status contains the step."""
     ends, statuses = [], []
     for roll in (mpm.rollout, one_by_one):
-        step = mpm.Step(box(dim, dx=1 / 32), LAWS_HERE["neo_hookean"]())
+        step = mpm.Step(unit_box(dim, dx=1 / 32), LAWS_HERE["neo_hookean"]())
         state = flow(dim, 0.05)
         state.v[11] = poison
         ends.append(roll(step, state, 12, DT))
@@ -114,7 +115,7 @@ def test_a_velocity_that_is_not_of_this_world(poison, dim):
 @torch.no_grad()
 def test_scenes_with_time_steps_of_their_own(dim):
     """One scene has dt = 0."""
-    step = mpm.Step(box(dim, scenes=3), LAWS_HERE["neo_hookean"](), walls="separate")
+    step = mpm.Step(unit_box(dim, scenes=3), LAWS_HERE["neo_hookean"](), walls="separate")
     scene = torch.arange(2000).remainder(3).int()
     state = step.prepare(flow(dim, 0.1, scene=scene).to(dtype=torch.float32))
     dt = torch.tensor([DT, 0.5 * DT, 0.0])
@@ -129,7 +130,7 @@ def test_scenes_of_a_deterministic_grid_do_not_depend_on_each_other(dim):
     scene = torch.arange(2000).remainder(2).int()
     ends = []
     for cells in (0.01, 0.4):
-        step = mpm.Step(box(dim, scenes=2, deterministic=True), LAWS_HERE["neo_hookean"](), walls="separate")
+        step = mpm.Step(unit_box(dim, scenes=2, deterministic=True), LAWS_HERE["neo_hookean"](), walls="separate")
         slow, fast = flow(dim, 0.05, scene=scene), flow(dim, cells, scene=scene)
         state = slow.replace(v=torch.where(scene[:, None] == 0, slow.v, fast.v))
         ends.append(mpm.rollout(step, state, N, DT).x[scene == 0])
@@ -138,7 +139,7 @@ def test_scenes_of_a_deterministic_grid_do_not_depend_on_each_other(dim):
 
 @torch.no_grad()
 def test_threads_change_nothing_where_particles_stray(dim):
-    step = mpm.Step(box(dim, dx=1 / 64), LAWS_HERE["neo_hookean"](), walls="separate")
+    step = mpm.Step(unit_box(dim, dx=1 / 64), LAWS_HERE["neo_hookean"](), walls="separate")
     state = flow(dim, 0.15, count=20000, dtype=torch.float32)
     ends, threads = [], torch.get_num_threads()
     for count in (1, 2, 3):
@@ -181,8 +182,8 @@ def test_gradients_with_as_many_blocks_as_the_pool_has():
     ones = torch.ones(1, dtype=F64)
     state = mpm.State(x=x, v=v, mass=ones, volume=1e-6 * ones)
     with pytest.raises(mpm.GridOverflowError):
-        mpm.rollout(mpm.Step(box(2, dx, max_blocks=1), mpm.NeoHookean(E=1e-3, nu=0.3)), state, 46, DT)
-    end = mpm.rollout(mpm.Step(box(2, dx, max_blocks=2), mpm.NeoHookean(E=1e-3, nu=0.3)), state, 46, DT)
+        mpm.rollout(mpm.Step(unit_box(2, dx, max_blocks=1), mpm.NeoHookean(E=1e-3, nu=0.3)), state, 46, DT)
+    end = mpm.rollout(mpm.Step(unit_box(2, dx, max_blocks=2), mpm.NeoHookean(E=1e-3, nu=0.3)), state, 46, DT)
     (grad,) = torch.autograd.grad(end.x.sum(), v)
     assert torch.allclose(grad, torch.full_like(grad, 46 * DT))
 
@@ -190,7 +191,7 @@ def test_gradients_with_as_many_blocks_as_the_pool_has():
 @torch.no_grad()
 @pytest.mark.parametrize("scenes", [1, 3])
 def test_no_particles(scenes, dim):
-    step = mpm.Step(box(dim, scenes=scenes), LAWS_HERE["sand"](), walls="slip")
+    step = mpm.Step(unit_box(dim, scenes=scenes), LAWS_HERE["sand"](), walls="slip")
     none = torch.zeros(0, dtype=torch.int32) if scenes > 1 else None
     state = step.prepare(blob("cpu", dim).select(torch.arange(0)).replace(scene=none))
     assert len(mpm.rollout(step, state, N, DT)) == 0
@@ -202,7 +203,7 @@ def test_the_pool_grows_while_activations_last(dim):
     """Particles fly apart from a few blocks."""
     ends = []
     for roll in (mpm.rollout, one_by_one):
-        grid = box(dim, 1 / 64)
+        grid = unit_box(dim, 1 / 64)
         step = mpm.Step(grid, LAWS_HERE["neo_hookean"]())
         state = blob("cpu", dim, 1000)
         x = 0.5 + 0.1 * (state.x - 0.5)
@@ -215,7 +216,7 @@ def test_the_pool_grows_while_activations_last(dim):
 
 @torch.no_grad()
 def test_many_chunks_in_a_block(dim):
-    step = mpm.Step(box(dim, 1 / 8), LAWS_HERE["fluid"](), walls="separate")
+    step = mpm.Step(unit_box(dim, 1 / 8), LAWS_HERE["fluid"](), walls="separate")
     state = step.prepare(flow(dim, 0.03, count=9000))
     assert_equal(mpm.rollout(step, state, N, DT), one_by_one(step, state, N, DT))
 
@@ -225,7 +226,7 @@ def test_many_chunks_in_a_block(dim):
 def test_walls_and_impulses_of_what_strays(walls, dim):
     ends = []
     for roll in (mpm.rollout, one_by_one):
-        step = mpm.Step(box(dim, 1 / 32), LAWS_HERE["neo_hookean"](), walls=walls, gravity=(0.0, -9.8, 0.0)[:dim])
+        step = mpm.Step(unit_box(dim, 1 / 32), LAWS_HERE["neo_hookean"](), walls=walls, gravity=(0.0, -9.8, 0.0)[:dim])
         step.boundaries = [mpm.Box((0.62,) * dim, (0.1,) * dim, kind="slip", velocity=(-3.0, 1.0, 0.0)[:dim])]
         state = flow(dim, 0.1)
         state = state.replace(x=state.x - 0.28)
@@ -241,7 +242,7 @@ def test_an_obstacle_that_comes_into_motion_later(dim):
     obstacle = mpm.Sphere((0.5,) * dim, 0.1, kind="sticky", angular_velocity=spin, start=10.5 * DT)
     statuses = []
     for roll in (mpm.rollout, one_by_one):
-        step = mpm.Step(box(dim, 1 / 32), LAWS_HERE["neo_hookean"](), boundaries=[obstacle])
+        step = mpm.Step(unit_box(dim, 1 / 32), LAWS_HERE["neo_hookean"](), boundaries=[obstacle])
         roll(step, flow(dim, 0.02), N, DT)
         statuses.append(step.status)
     assert torch.equal(*(s[:, PROBLEM] for s in statuses))
@@ -250,7 +251,7 @@ def test_an_obstacle_that_comes_into_motion_later(dim):
 
 @torch.no_grad()
 def test_a_paused_scene_that_is_fast(dim):
-    step = mpm.Step(box(dim, scenes=2), LAWS_HERE["neo_hookean"](), walls="separate")
+    step = mpm.Step(unit_box(dim, scenes=2), LAWS_HERE["neo_hookean"](), walls="separate")
     scene = torch.arange(2000).remainder(2).int()
     state = step.prepare(flow(dim, 0.1, scene=scene).to(dtype=torch.float32))
     state.v[scene == 1] *= 1e5

@@ -7,13 +7,12 @@ import torch
 from torch import Tensor, nn
 
 import torch_mpm as mpm
+from benchmarks.catalogue import scenes
 from torch_mpm import heat_boundaries
 
 
 def block(device: str = "cpu", dtype: torch.dtype = torch.float64) -> tuple[mpm.Grid, mpm.State]:
-    grid = mpm.Grid(0.1, (0, 0), (1, 1))
-    points = mpm.seed.box((0.3, 0.2), (0.6, 0.5), grid, per_cell=4)
-    return grid, mpm.State.at_rest(points, 1000.0, (1.0, -2.0), dtype=dtype, device=device)
+    return scenes.unit_box(2, 0.1), scenes.block((0.3, 0.2), (0.6, 0.5), 0.1, 1000.0, (1.0, -2.0), dtype, device)
 
 
 class Wind(nn.Module):

@@ -3,11 +3,12 @@
 import pytest
 import torch
 from cases.rollout_gradients import assert_same, gradients, moving
-from cases.rollouts import F64, LAWS_HERE, TRANSFERS, assert_equal, blob, box, one_by_one
+from cases.rollouts import F64, LAWS_HERE, TRANSFERS, assert_equal, one_by_one
 from helpers import OpNames
 from torch import Tensor
 
 import torch_mpm as mpm
+from benchmarks.catalogue.scenes import blob, unit_box
 from torch_mpm.rollouts import fused_op, plan, until_time
 
 DT = 1e-4
@@ -47,7 +48,7 @@ def case(dim: int, device: str, dtype: torch.dtype = F64, **options) -> tuple[mp
         LAWS_HERE["fluid"](),
         mpm.Active(LAWS_HERE["viscoelastic"](), fibres),
     ]
-    step = mpm.Step(box(dim, scenes=scenes), mpm.Mixture(laws), walls="separate", **options).to(device, dtype)
+    step = mpm.Step(unit_box(dim, scenes=scenes), mpm.Mixture(laws), walls="separate", **options).to(device, dtype)
     number = torch.arange(count, device=device)
     state = blob(device, dim, count, dtype).replace(material=(number % 4).int(), scene=(number // 3 % scenes).int())
     state = step.prepare(state)
@@ -99,7 +100,7 @@ def test_who_sorts_is_left_alone(device, sorts):
     step, state = case(3, device)
     mpm.rollout(step, state.replace(ids=torch.randperm(len(state)).to(device)), 9, DT)
     mpm.rollout(step, state, 3, DT)
-    mpm.rollout(mpm.Step(box(3), LAWS_HERE["snow"]()), blob(device, 3, 90), 9, DT)
+    mpm.rollout(mpm.Step(unit_box(3), LAWS_HERE["snow"]()), blob(device, 3, 90), 9, DT)
     assert not sorts
 
 
@@ -150,7 +151,7 @@ def test_a_hook_sees_the_order_that_was_given(device, sorts):
 def test_as_it_is(monkeypatch, sorts):
     monkeypatch.undo()
     state = blob("cuda", 3, 2**15, torch.float32)
-    step = mpm.Step(box(3, 1 / 40), mpm.NeoHookean(E=1e3, nu=0.3))
+    step = mpm.Step(unit_box(3, 1 / 40), mpm.NeoHookean(E=1e3, nu=0.3))
     end = mpm.rollout(step, state, 64, DT)
     assert end.ids is None
     assert_equal(end, one_by_one(step, state, 64, DT))

@@ -2,9 +2,9 @@
 
 import pytest
 import torch
-from cases.steps import block_state, make_step
 
 import torch_mpm as mpm
+from benchmarks.catalogue.scenes import block_state, make_step
 from torch_mpm.step.particle_operations import Hold, Operations, Present, Push
 
 DT = 1e-3

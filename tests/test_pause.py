@@ -8,6 +8,7 @@ import torch
 
 import torch_mpm as mpm
 from benchmarks.catalogue.laws import named
+from benchmarks.catalogue.scenes import block
 
 DT = 1e-3
 LAWS = named("neo_hookean", "sand", "fluid", "herschel_bulkley", "snow")
@@ -18,10 +19,7 @@ def scenes(count, device, law="neo_hookean", obstacle=True, **options):
     grid = mpm.Grid(0.1, (0, 0), (1, 1), scenes=count)
     boundaries = [mpm.Sphere((0.5, 0.2), 0.15, friction=0.3)] if obstacle else []
     step = mpm.Step(grid, LAWS[law](), (0.5, -9.8), walls="slip", boundaries=boundaries, **options)
-    points = mpm.seed.box((0.3, 0.3), (0.6, 0.6), 0.1, per_cell=4)
-    states = [
-        mpm.State.at_rest(points, velocity=(0.5 - k, -1.0), dtype=torch.float64, device=device) for k in range(count)
-    ]
+    states = [block((0.3, 0.3), (0.6, 0.6), 0.1, velocity=(0.5 - k, -1.0), device=device) for k in range(count)]
     state = states[0] if count == 1 else mpm.State.concatenate(states, scene=True)
     return step, mpm.rollout(step, state, 5, DT)
 

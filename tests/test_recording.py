@@ -2,16 +2,19 @@
 
 import pytest
 import torch
-from cases.rollouts import F64, blob, box
+from cases.rollouts import F64
 from helpers import TOLERANCE
 
 import torch_mpm as mpm
+from benchmarks.catalogue.scenes import blob, unit_box
 
 DT = 1e-4
 
 
 def fall(dim: int = 3, **options: object) -> mpm.Step:
-    return mpm.Step(box(dim), mpm.VonMises(E=1e4, nu=0.3, yield_stress=50.0), (0.0, -9.8, 0.0)[:dim], "slip", **options)
+    return mpm.Step(
+        unit_box(dim), mpm.VonMises(E=1e4, nu=0.3, yield_stress=50.0), (0.0, -9.8, 0.0)[:dim], "slip", **options
+    )
 
 
 @pytest.mark.parametrize("n,every", [(6, 1), (6, 2), (7, 3), (2, 5), (0, 1)])
@@ -69,7 +72,7 @@ def test_gradients_pass_through_frames_and_controls(checkpoint, device):
     """A loss on every frame, by controls over time: as single steps give it."""
 
     def loss(of_frames: bool) -> tuple[torch.Tensor, ...]:
-        step, state = mpm.Step(box(2), mpm.NeoHookean(E=1e4, nu=0.3)), blob(device, 2)
+        step, state = mpm.Step(unit_box(2), mpm.NeoHookean(E=1e4, nu=0.3)), blob(device, 2)
         control = torch.linspace(0.1, 1, 6, dtype=F64).reshape(3, 2).to(device).requires_grad_()
 
         def hook(state: mpm.State, k: int) -> mpm.State:
@@ -92,7 +95,7 @@ def test_gradients_pass_through_frames_and_controls(checkpoint, device):
 
 def test_any_function_is_a_step_and_dt_may_be_of_scenes(device):
     state = blob(device, scene=(torch.arange(300) % 2).int())
-    step = mpm.Step(box(scenes=2), mpm.NeoHookean(E=1e4, nu=0.3))
+    step = mpm.Step(unit_box(scenes=2), mpm.NeoHookean(E=1e4, nu=0.3))
     dt = torch.tensor([1e-4, 2e-4], dtype=F64, device=device)
     found = mpm.frames(lambda s, dt: step(s, dt), state.replace(time=torch.zeros_like(dt)), 3, dt)
     torch.testing.assert_close(found.time, torch.arange(4, device=device)[:, None] * dt)
@@ -119,7 +122,7 @@ def test_wrong_arguments():
 def test_times_of_frames(dt, time, n, device):
     """Including the time of the start, which may be a number where dt is a tensor."""
     dt, time = (t.to(device) if isinstance(t, torch.Tensor) else t for t in (dt, time))
-    step = mpm.Step(box(2, scenes=2), mpm.NeoHookean(E=1e4, nu=0.3))
+    step = mpm.Step(unit_box(2, scenes=2), mpm.NeoHookean(E=1e4, nu=0.3))
     state = mpm.State.concatenate([blob(device, 2, 20)] * 2, scene=True).replace(time=time)
     with torch.no_grad():
         found = mpm.frames(step, state, n, dt, every=2)

@@ -3,10 +3,11 @@
 import pytest
 import torch
 from cases.rollout_gradients import assert_same, loss, moving
-from cases.rollouts import F64, LAWS_HERE, blob, box, one_by_one
+from cases.rollouts import F64, LAWS_HERE, one_by_one
 from torch import Tensor
 
 import torch_mpm as mpm
+from benchmarks.catalogue.scenes import blob, unit_box
 
 DT, STEPS = 1e-4, 6
 LAWS = ["neo_hookean", "fluid", "von_mises", "herschel_bulkley", "viscoelastic", "sand"]
@@ -18,7 +19,7 @@ def case(law: str, dim: int, device: str, scenes: int = 1, **options) -> tuple[m
     gravity = torch.randn(scenes, dim, dtype=F64, device=device).requires_grad_()
     floor = mpm.Plane((0.0, 0.35, 0.0)[:dim], (0.1, 1.0, 0.0)[:dim], "separate", friction=0.2)
     step = mpm.Step(
-        box(dim, scenes=scenes), LAWS_HERE[law](), gravity, walls="separate", boundaries=[floor], **options
+        unit_box(dim, scenes=scenes), LAWS_HERE[law](), gravity, walls="separate", boundaries=[floor], **options
     ).to(device)
     scene = {} if scenes == 1 else {"scene": (torch.arange(300, device=device) % scenes).int()}
     return step, moving(step, blob(device, dim).replace(**scene))

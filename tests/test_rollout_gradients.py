@@ -23,13 +23,10 @@ from cases.rollouts import (
     TRANSFERS,
     WALLS,
     assert_equal,
-    blob,
-    box,
     each_scene,
     flying,
     mixture,
     one_by_one,
-    touched,
 )
 from combinations import DT as CASE_DT
 from combinations import draw, make
@@ -37,6 +34,7 @@ from helpers import TOLERANCE
 from torch import Tensor
 
 import torch_mpm as mpm
+from benchmarks.catalogue.scenes import blob, touched, unit_box
 from torch_mpm.ops.contact import obstacle_arguments
 from torch_mpm.ops.grid_update import wall_arguments
 from torch_mpm.rollouts import budget, fused_op
@@ -66,7 +64,7 @@ def test_random_simulations(seed, device):
 @pytest.mark.parametrize("transfer", SOME_TRANSFERS)
 def test_laws(law, every, transfer, dim, device):
     options = {"walls": "separate", **TRANSFERS[transfer]}
-    step = mpm.Step(box(dim), with_gradients(LAWS_HERE[law]()), pulled(dim), **options).to(device)
+    step = mpm.Step(unit_box(dim), with_gradients(LAWS_HERE[law]()), pulled(dim), **options).to(device)
     state = moving(step, blob(device, dim))
     tolerance = "rollout with FLIP" if "flip" in transfer else ""
     assert_same(gradients(in_op(every), step, state), gradients(single(), step, state), tolerance)
@@ -79,7 +77,9 @@ def test_laws(law, every, transfer, dim, device):
 def test_transfers(transfer, form, law, dtype, kernel, device):
     """Viscous laws read C without APIC too. With FLIP what the mass gives is a small difference of two transfers."""
     options = {"stress_form": form, "walls": "slip", **TRANSFERS[transfer]}
-    step = mpm.Step(box(kernel=kernel), with_gradients(LAWS_HERE[law](), dtype), pulled(3, dtype), **options).to(device)
+    step = mpm.Step(unit_box(kernel=kernel), with_gradients(LAWS_HERE[law](), dtype), pulled(3, dtype), **options).to(
+        device
+    )
     state = moving(step, blob(device, dtype=dtype))
     tolerance = "rollout" if "flip" in transfer and dtype == torch.float32 else ""
     assert_same(gradients(in_op(2), step, state), gradients(single(), step, state), tolerance)
@@ -90,7 +90,7 @@ def test_transfers(transfer, form, law, dtype, kernel, device):
 @pytest.mark.parametrize("n", [1, 40])
 def test_walls(transfer, walls, n, dim, device):
     options = {"walls": touched(walls, dim), **TRANSFERS[transfer]}
-    step = mpm.Step(box(dim), with_gradients(mpm.NeoHookean(E=1e4, nu=0.3)), pulled(dim), **options).to(device)
+    step = mpm.Step(unit_box(dim), with_gradients(mpm.NeoHookean(E=1e4, nu=0.3)), pulled(dim), **options).to(device)
     state = moving(step, blob(device, dim))
     assert_same(gradients(in_op(ALL, n), step, state), gradients(single(n), step, state))
 
@@ -98,7 +98,7 @@ def test_walls(transfer, walls, n, dim, device):
 @pytest.mark.parametrize("deterministic", [False, True])
 @pytest.mark.parametrize("transfer", SOME_TRANSFERS)
 def test_mixtures(deterministic, transfer, dim, device):
-    grid, options = box(dim, deterministic=deterministic), {"walls": "sticky", **TRANSFERS[transfer]}
+    grid, options = unit_box(dim, deterministic=deterministic), {"walls": "sticky", **TRANSFERS[transfer]}
     step = mpm.Step(grid, with_gradients(mixture()), **options).to(device)
     material = torch.randint(0, 7, (400,), dtype=torch.int32, device=device)
     state = moving(step, blob(device, dim, 400)).replace(material=material, ids=torch.randperm(400).to(device))
@@ -121,7 +121,7 @@ def batch(dim: int, device: str, transfer: str = "apic") -> tuple[mpm.Step, mpm.
         mpm.Plane((0.0, 0.35, 0.0)[:dim], (0.0, 1.0, 0.0)[:dim], kind="separate", end=3e-4),
     ]
     gravity = torch.randn(scenes, dim, dtype=F64).to(device).requires_grad_()
-    grid = box(dim, scenes=scenes)
+    grid = unit_box(dim, scenes=scenes)
     options = {"boundaries": obstacles, "walls": "mirror", **TRANSFERS[transfer]}
     step = mpm.Step(grid, mpm.NeoHookean(mu=mu, lam=lam), gravity, **options)
     return step, moving(step, state)
@@ -166,7 +166,7 @@ def test_grids_are_kept_where_particles_are_dense(law, transfer, device):
     """With obstacles; gradients equal those of recomputed steps."""
     one, _ = batch(2, device)
     options = {"walls": "slip", "boundaries": one.boundaries.entries, **TRANSFERS[transfer]}
-    step = mpm.Step(box(2), with_gradients(LAWS_HERE[law]()), pulled(2), **options)
+    step = mpm.Step(unit_box(2), with_gradients(LAWS_HERE[law]()), pulled(2), **options)
     step, state = step.to(device), moving(step, blob(device, 2, 4000))
     start = state.replace(v=state.v.clone().requires_grad_())
     end = mpm.rollout(step, start, STEPS, DT, checkpoint=ALL)
@@ -180,7 +180,7 @@ def test_grids_are_kept_where_particles_are_dense(law, transfer, device):
 
 
 def test_a_step_that_was_taken_in_inference_mode_is_trained(device):
-    step, state = mpm.Step(box(2), mpm.NeoHookean(E=1e4, nu=0.3)), blob(device, 2)
+    step, state = mpm.Step(unit_box(2), mpm.NeoHookean(E=1e4, nu=0.3)), blob(device, 2)
     with torch.inference_mode():
         mpm.rollout(step, state, 3, DT)
     v = state.v.clone().requires_grad_()
@@ -190,7 +190,7 @@ def test_a_step_that_was_taken_in_inference_mode_is_trained(device):
 
 def test_recorded_steps_in_checkpoints_of_torch(device):
     def ends(around: bool) -> Tensor:
-        step, v = mpm.Step(box(2, max_blocks=36), mpm.NeoHookean(E=1e4, nu=0.3)), state.v.clone().requires_grad_()
+        step, v = mpm.Step(unit_box(2, max_blocks=36), mpm.NeoHookean(E=1e4, nu=0.3)), state.v.clone().requires_grad_()
 
         def taken(v: Tensor) -> Tensor:
             return mpm.rollout(step, state.replace(v=v), 3, DT, checkpoint=ALL).x
@@ -204,7 +204,7 @@ def test_recorded_steps_in_checkpoints_of_torch(device):
 
 
 def test_the_status_goes_on_from_call_to_call_of_recorded_steps(device):
-    step, state = mpm.Step(box(2), mpm.NeoHookean(E=1e4, nu=0.3)), blob(device, 2)
+    step, state = mpm.Step(unit_box(2), mpm.NeoHookean(E=1e4, nu=0.3)), blob(device, 2)
     start = state.replace(v=state.v.clone().requires_grad_())
     middle = mpm.rollout(step, start, 3, DT, checkpoint=ALL)
     x = middle.x.clone()
@@ -225,7 +225,7 @@ def test_a_state_is_kept_every_so_many_steps(every, calls, device, monkeypatch):
 
     substeps = fused_op.substeps
     monkeypatch.setattr(fused_op, "substeps", counted)
-    step, state = mpm.Step(box(2), mpm.NeoHookean(E=1e4, nu=0.3)), blob(device, 2)
+    step, state = mpm.Step(unit_box(2), mpm.NeoHookean(E=1e4, nu=0.3)), blob(device, 2)
     mpm.rollout(step, state.replace(v=state.v.clone().requires_grad_()), 6, DT, checkpoint=every)
     assert len(taken) == calls
     assert sum(taken) == 6
@@ -249,7 +249,7 @@ def lost(state: mpm.State) -> mpm.State:
 @pytest.mark.parametrize("transfer", SOME_TRANSFERS)
 def test_lost_particles(law, form, transfer, device):
     options = {"walls": "slip", "stress_form": form, **TRANSFERS[transfer]}
-    step = mpm.Step(box(), with_gradients(LAWS_HERE[law]()), **options).to(device)
+    step = mpm.Step(unit_box(), with_gradients(LAWS_HERE[law]()), **options).to(device)
     state = lost(moving(step, blob(device)))
     expected = gradients(single(), step, state)
     assert all(bool(g.isfinite().all()) for g in expected.values() if g is not None)
@@ -260,10 +260,10 @@ def test_lost_particles(law, form, transfer, device):
 def test_a_pool_that_grows():
     state, dt = flying("cpu")
     law = {"E": torch.tensor(1.0, dtype=F64, requires_grad=True), "nu": 0.3}
-    step = mpm.Step(box(dx=1 / 64), mpm.NeoHookean(**law))
-    expected = gradients(single(8, dt), mpm.Step(box(dx=1 / 64), mpm.NeoHookean(**law)), state)
+    step = mpm.Step(unit_box(dx=1 / 64), mpm.NeoHookean(**law))
+    expected = gradients(single(8, dt), mpm.Step(unit_box(dx=1 / 64), mpm.NeoHookean(**law)), state)
     assert_same(gradients(in_op(3, 8, dt), step, state), expected)
-    step = mpm.Step(box(dx=1 / 64), mpm.NeoHookean(**law))
+    step = mpm.Step(unit_box(dx=1 / 64), mpm.NeoHookean(**law))
     assert_same(gradients(in_op(ALL, 8, dt), step, state), expected)
 
 
@@ -280,7 +280,7 @@ def test_no_scenes(device):
 @pytest.mark.parametrize("transfer", SOME_TRANSFERS)
 def test_no_particles(transfer, device):
     law = with_gradients(mpm.VonMises(E=1e4, nu=0.3, yield_stress=1.0))
-    step = mpm.Step(box(), law, pulled(3), **TRANSFERS[transfer]).to(device)
+    step = mpm.Step(unit_box(), law, pulled(3), **TRANSFERS[transfer]).to(device)
     for gradient in gradients(in_op(), step, step.prepare(blob(device, count=0))).values():
         assert gradient is None or float(gradient.norm()) == 0
 
@@ -306,7 +306,7 @@ def test_gradcheck(law, transfer, device):
     }.get(law, {})
 
     def run(x: Tensor, v: Tensor, F: Tensor, mass: Tensor, E: Tensor, gravity: Tensor) -> Tensor:
-        step = mpm.Step(box(2, 0.125), make(E=E, nu=0.3, **others), gravity, walls="slip", **TRANSFERS[transfer])
+        step = mpm.Step(unit_box(2, 0.125), make(E=E, nu=0.3, **others), gravity, walls="slip", **TRANSFERS[transfer])
         return loss(mpm.rollout(step, state.replace(x=x, v=v, F=F, mass=mass), 3, 1e-2, checkpoint=2))
 
     inputs = (
@@ -323,7 +323,9 @@ def test_gradcheck(law, transfer, device):
 
 def test_a_difference_of_many_steps(device):
     """A drop on a ball, 40 steps: the derivative along a random direction."""
-    step = mpm.Step(box(2), mpm.FixedCorotated(E=1e3, nu=0.3), (0.0, -9.8), boundaries=[mpm.Sphere((0.5, 0.3), 0.1)])
+    step = mpm.Step(
+        unit_box(2), mpm.FixedCorotated(E=1e3, nu=0.3), (0.0, -9.8), boundaries=[mpm.Sphere((0.5, 0.3), 0.1)]
+    )
     state = blob(device, 2)
     direction = torch.randn(state.x.shape, dtype=F64).to(device)
 
@@ -341,7 +343,7 @@ def test_a_difference_of_many_steps(device):
 
 
 def test_a_second_derivative_is_refused(device):
-    step, state = mpm.Step(box(2), mpm.NeoHookean(E=1e4, nu=0.3)), blob(device, 2)
+    step, state = mpm.Step(unit_box(2), mpm.NeoHookean(E=1e4, nu=0.3)), blob(device, 2)
     v = state.v.clone().requires_grad_()
 
     def second(move: Callable[..., mpm.State]) -> Tensor:
@@ -383,7 +385,7 @@ def raw_arguments(device: str) -> list:
     scene, material = (torch.arange(40) % 2).int().to(device), (torch.arange(40) // 2 % 2).int().to(device)
     F = torch.eye(2, dtype=F64) + 0.05 * torch.randn(40, 2, 2, generator=g, dtype=F64)
     scalar = torch.tensor(2e3, dtype=F64, device=device)
-    grid = box(2, scenes=2, max_blocks=64, deterministic=True)
+    grid = unit_box(2, scenes=2, max_blocks=64, deterministic=True)
     ball = [mpm.Sphere((0.5, 0.4), 0.1)]
     laws = ("von_mises,neo_hookean", [0, 0], [scalar, scalar, 0.01 * scalar, scalar, scalar, 0.5 * scalar], [1, 0])
     particles = (state.x, state.v, state.mass, state.volume, 0.1 * F.to(device), F.to(device), None, 1e-9 * state.x)

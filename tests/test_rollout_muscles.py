@@ -5,10 +5,11 @@ from collections.abc import Callable
 import pytest
 import torch
 from cases.rollout_gradients import assert_same, gradients, in_op, moving, single, with_gradients
-from cases.rollouts import LAWS_HERE, SOME_TRANSFERS, TRANSFERS, assert_equal, blob, box, in_one_op, one_by_one
+from cases.rollouts import LAWS_HERE, SOME_TRANSFERS, TRANSFERS, assert_equal, in_one_op, one_by_one
 from torch import Tensor
 
 import torch_mpm as mpm
+from benchmarks.catalogue.scenes import blob, unit_box
 
 F64, DT = torch.float64, 1e-4
 SOLIDS = [name for name in LAWS_HERE if name != "fluid"]
@@ -34,7 +35,7 @@ def flexed(state: mpm.State, most: float = 3e3) -> mpm.State:
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
 def test_muscles(law, n, transfer, dtype, dim, device):
     muscle = mpm.Active(LAWS_HERE[law](), fibres(dim, device, dtype=dtype))
-    step = mpm.Step(box(dim), muscle, gravity=(0.0, -9.8, 0.0)[:dim], walls="separate", **TRANSFERS[transfer])
+    step = mpm.Step(unit_box(dim), muscle, gravity=(0.0, -9.8, 0.0)[:dim], walls="separate", **TRANSFERS[transfer])
     state = flexed(step.prepare(blob(device, dim, dtype=dtype)))
     state.x[5] = -3.0  # outside
     assert in_one_op(step, state)
@@ -51,7 +52,7 @@ def test_muscles_of_a_mixture(sort, dim, device):
     d = fibres(dim, device)
     muscles = [mpm.Active(LAWS_HERE[name](), d) for name in ("von_mises", "neo_hookean")]
     laws = [LAWS_HERE["sand"](), muscles[0], LAWS_HERE["fluid"](), muscles[1]]
-    step = mpm.Step(box(dim), mpm.Mixture(laws), gravity=(0.0, -9.8, 0.0)[:dim], walls="sticky")
+    step = mpm.Step(unit_box(dim), mpm.Mixture(laws), gravity=(0.0, -9.8, 0.0)[:dim], walls="sticky")
     material = torch.arange(300, device=device).int() % 4
     state = step.prepare(blob(device, dim).replace(material=material, ids=torch.randperm(300).to(device)))
     state = flexed(state)
@@ -67,7 +68,7 @@ def test_muscles_in_scenes_with_obstacles_that_rearrange(device):
     scene = (torch.arange(count, device=device) % scenes).int()
     path = lambda t: torch.stack([0.5 + 5 * t, 0.4 + 0 * t, 0.5 + 0 * t])  # noqa: E731
     step = mpm.Step(
-        box(3, scenes=scenes), mpm.Active(LAWS_HERE["fixed_corotated"](), (0.0, 1.0, 0.0)),
+        unit_box(3, scenes=scenes), mpm.Active(LAWS_HERE["fixed_corotated"](), (0.0, 1.0, 0.0)),
         boundaries=[mpm.Sphere(path, 0.1)], walls="slip",
     )  # fmt: skip
     state = flexed(step.prepare(blob(device, 3, count).replace(scene=scene)))
@@ -80,7 +81,7 @@ def test_muscles_in_scenes_with_obstacles_that_rearrange(device):
 def test_gradients(law, every, dim, device):
     """By activation, direction of each particle and moduli, beside a law that changes nothing and one that flows."""
     muscle = with_gradients(mpm.Active(LAWS_HERE[law](), fibres(dim, device).requires_grad_()))
-    step = mpm.Step(box(dim), muscle, walls="separate").to(device)
+    step = mpm.Step(unit_box(dim), muscle, walls="separate").to(device)
     state = flexed(moving(step, blob(device, dim)))
     got, expected = gradients(in_op(every), step, state), gradients(single(), step, state)
     for name in ("activation", "law.direction"):
@@ -91,7 +92,7 @@ def test_gradients(law, every, dim, device):
 def test_gradients_of_a_mixture(dim, device):
     d = fibres(dim, device)[0].clone().requires_grad_()
     laws = [mpm.Active(LAWS_HERE["von_mises"](), d), LAWS_HERE["fluid"](), mpm.Active(LAWS_HERE["neo_hookean"](), d)]
-    step = mpm.Step(box(dim), with_gradients(mpm.Mixture(laws))).to(device)
+    step = mpm.Step(unit_box(dim), with_gradients(mpm.Mixture(laws))).to(device)
     state = flexed(moving(step, blob(device, dim).replace(material=torch.arange(300, device=device).int() % 3)))
     assert_same(gradients(in_op(2), step, state), gradients(single(), step, state), "rollout")
 
@@ -99,7 +100,7 @@ def test_gradients_of_a_mixture(dim, device):
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
 def test_a_controller_over_time(dtype, device):
     """A tensor of activations over time, which a hook hands out: the calls between two of them are one op."""
-    step = mpm.Step(box(2), mpm.Active(mpm.NeoHookean(E=1e4, nu=0.3), (0.6, 0.8)))
+    step = mpm.Step(unit_box(2), mpm.Active(mpm.NeoHookean(E=1e4, nu=0.3), (0.6, 0.8)))
     start = step.prepare(blob(device, 2, dtype=dtype))
 
     def by(take: Callable[..., mpm.State]) -> tuple[Tensor, Tensor]:
@@ -126,7 +127,7 @@ def test_a_controller_over_time(dtype, device):
 @torch.no_grad()
 def test_an_activation_that_is_no_number_is_told(device):
     """Not hidden, as a controller that diverges would like to be."""
-    step = mpm.Step(box(), mpm.Active(mpm.NeoHookean(E=1e4, nu=0.3), (1.0, 0.0, 0.0)))
+    step = mpm.Step(unit_box(), mpm.Active(mpm.NeoHookean(E=1e4, nu=0.3), (1.0, 0.0, 0.0)))
     state = step.prepare(blob(device))
     state = state.replace(extra={**state.extra, "activation": torch.full_like(state.mass, float("nan"))})
     assert not bool(mpm.rollout(step, state, 3, DT).v.isfinite().all())
@@ -134,7 +135,7 @@ def test_an_activation_that_is_no_number_is_told(device):
 
 
 def test_what_is_no_law_beside_another_is_refused(device):
-    step = mpm.Step(box(), mpm.Active(mpm.NeoHookean(E=1e4, nu=0.3), (1.0, 0.0, 0.0)))
+    step = mpm.Step(unit_box(), mpm.Active(mpm.NeoHookean(E=1e4, nu=0.3), (1.0, 0.0, 0.0)))
     arguments = mpm.substeps_arguments(step, step.prepare(blob(device)), 2, DT)
     assert arguments["laws"] == "neo_hookean+fibre"
     for laws, message in (

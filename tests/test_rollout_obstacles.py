@@ -7,19 +7,12 @@ import sys
 import pytest
 import torch
 from cases.rollout_gradients import assert_same, gradients, in_op, moving, single
-from cases.rollouts import (
-    SOME_TRANSFERS,
-    TRANSFERS,
-    assert_equal,
-    blob,
-    box,
-    in_one_op,
-    one_by_one,
-)
+from cases.rollouts import SOME_TRANSFERS, TRANSFERS, assert_equal, in_one_op, one_by_one
 from helpers import TOLERANCE
 from torch import Tensor
 
 import torch_mpm as mpm
+from benchmarks.catalogue.scenes import blob, unit_box
 from torch_mpm.ops.contact import MAX_OBSTACLES
 from torch_mpm.rollouts import fused_op, plan
 
@@ -72,7 +65,9 @@ def bodies(dim: int, path, **options) -> list[mpm.boundaries.Obstacle]:
 def test_paths(path, n, transfer, dtype, dim, device):
     state = blob(device, dim, dtype=dtype)
     obstacles = bodies(dim, PATHS[path](dim, device))
-    step = mpm.Step(box(dim), mpm.NeoHookean(E=1e4, nu=0.3), boundaries=obstacles, **TRANSFERS[transfer]).to(device)
+    step = mpm.Step(unit_box(dim), mpm.NeoHookean(E=1e4, nu=0.3), boundaries=obstacles, **TRANSFERS[transfer]).to(
+        device
+    )
     assert in_one_op(step, state)
     with torch.no_grad():
         end = mpm.rollout(step, state, n, DT)
@@ -88,7 +83,9 @@ def test_paths_of_scenes_with_clocks_of_their_own(scenes, n, dim, device):
     state = blob(device, dim, scene=torch.arange(300, dtype=torch.int32) % scenes)
     state = state.replace(scene=state.scene.int(), time=1e-4 * torch.arange(scenes, dtype=F64, device=device))
     dt = 1e-4 * (1 + 0.1 * torch.arange(scenes, dtype=F64, device=device))
-    step = mpm.Step(box(dim, scenes=scenes), mpm.NeoHookean(E=1e4, nu=0.3), boundaries=bodies(dim, smooth(dim, device)))
+    step = mpm.Step(
+        unit_box(dim, scenes=scenes), mpm.NeoHookean(E=1e4, nu=0.3), boundaries=bodies(dim, smooth(dim, device))
+    )
     with torch.no_grad():
         assert step.explain(state, dt).startswith("all steps in one op")
         assert_equal_clocks(mpm.rollout(step, state, n, dt), one_by_one(step, state, n, dt))
@@ -108,7 +105,7 @@ def test_paths_in_small_scenes(clocks, deterministic, dim, device):
     for scenes, count in ((1, 2000), (40, 4000)):
         scene = (torch.arange(count, device=device) % scenes).int()
         state = blob(device, dim, count, torch.float32).replace(scene=scene)
-        grid = box(dim, scenes=scenes, deterministic=deterministic)
+        grid = unit_box(dim, scenes=scenes, deterministic=deterministic)
         obstacles = bodies(dim, smooth(dim, device))
         obstacles[1].velocity = torch.rand(scenes, dim, device=device)
         step = mpm.Step(grid, mpm.NeoHookean(E=1e3, nu=0.3), boundaries=obstacles)
@@ -126,7 +123,7 @@ def test_paths_in_small_scenes(clocks, deterministic, dim, device):
 def test_paths_among_many_particles():
     """G2P and the next P2G are one kernel here."""
     state = blob("cuda", 3, 2**18, torch.float32)
-    step = mpm.Step(box(3, 1 / 40), mpm.NeoHookean(E=1e3, nu=0.3), boundaries=bodies(3, smooth(3, "cuda")))
+    step = mpm.Step(unit_box(3, 1 / 40), mpm.NeoHookean(E=1e3, nu=0.3), boundaries=bodies(3, smooth(3, "cuda")))
     assert in_one_op(step, state)
     assert_equal(mpm.rollout(step, state, 20, DT), one_by_one(step, state, 20, DT))
 
@@ -135,7 +132,7 @@ def test_paths_among_many_particles():
 def test_paths_in_calls_of_few_steps(monkeypatch, device):
     """Where tables of all steps would take too much memory."""
     state, obstacles = blob(device), bodies(3, smooth(3, device))
-    step = mpm.Step(box(), mpm.NeoHookean(E=1e4, nu=0.3), boundaries=obstacles)
+    step = mpm.Step(unit_box(), mpm.NeoHookean(E=1e4, nu=0.3), boundaries=obstacles)
     expected, calls, whole = one_by_one(step, state, 17, DT), [], fused_op.substeps
     monkeypatch.setattr(plan, "_path_bytes", lambda *_: 2**26 // 5)
     monkeypatch.setattr(fused_op, "substeps", lambda *a: calls.append(a[2]) or whole(*a))
@@ -147,7 +144,7 @@ def test_paths_in_calls_of_few_steps(monkeypatch, device):
 @pytest.mark.parametrize("shape", [(4,), (2, 3), (1, 1, 3), ()])
 def test_a_path_of_another_shape_is_refused(shape, device):
     wrong = mpm.Sphere(lambda t: torch.zeros(shape, dtype=t.dtype, device=device) + 0 * t, 0.1)
-    step = mpm.Step(box(), mpm.NeoHookean(E=1e4, nu=0.3), boundaries=[wrong])
+    step = mpm.Step(unit_box(), mpm.NeoHookean(E=1e4, nu=0.3), boundaries=[wrong])
     with pytest.raises((ValueError, RuntimeError), match=r"position must|parameters of obstacles must"):
         mpm.rollout(step, blob(device), 3, DT)
 
@@ -157,7 +154,7 @@ def test_what_a_path_raises_is_raised(device):
     def lost(t: Tensor) -> Tensor:
         raise LookupError("no such place")
 
-    step = mpm.Step(box(), mpm.NeoHookean(E=1e4, nu=0.3), boundaries=[mpm.Sphere(lost, 0.1)])
+    step = mpm.Step(unit_box(), mpm.NeoHookean(E=1e4, nu=0.3), boundaries=[mpm.Sphere(lost, 0.1)])
     with pytest.raises(LookupError, match="no such place"):
         mpm.rollout(step, blob(device), 3, DT)
 
@@ -181,7 +178,9 @@ def test_many_obstacles(count, dim, device):
         return [form(p, 0.05, kinds[k % 3], friction=0.1 * (k % 4)) for k, p in enumerate(places)]
 
     state = blob(device, dim)
-    step, plain = (mpm.Step(box(dim), mpm.NeoHookean(E=1e4, nu=0.3), boundaries=pegs(f)) for f in (mpm.Sphere, Plain))
+    step, plain = (
+        mpm.Step(unit_box(dim), mpm.NeoHookean(E=1e4, nu=0.3), boundaries=pegs(f)) for f in (mpm.Sphere, Plain)
+    )
     assert in_one_op(step, state) == (count <= MAX_OBSTACLES) and not in_one_op(plain, state)
     expected = one_by_one(plain, state, 6, DT)
     assert_equal(mpm.rollout(step, state, 6, DT), expected)
@@ -194,7 +193,7 @@ def test_a_time_is_reached_beside_a_path(device):
     ends = []
     for form in (mpm.Sphere, Plain):
         obstacles = [form(waypoints(3, device), 0.15, "separate").to(device), form((0.55,) * 3, 0.12, "slip")]
-        step = mpm.Step(box(), mpm.NeoHookean(E=1e4, nu=0.3), boundaries=obstacles)
+        step = mpm.Step(unit_box(), mpm.NeoHookean(E=1e4, nu=0.3), boundaries=obstacles)
         assert in_one_op(step, state) == (form is mpm.Sphere)
         ends.append(mpm.rollout_to(step, state, 3e-3, every=4))
     assert bool(ends[0].arrived.all())
@@ -213,7 +212,9 @@ def test_a_path_is_asked_where_the_obstacle_is(clocks, device):
 
     state = blob(device)
     state = state.replace(time=torch.zeros(1, dtype=F64, device=device)) if clocks else state
-    step = mpm.Step(box(), mpm.NeoHookean(E=1e4, nu=0.3), boundaries=[mpm.Sphere(path, 0.15, start=2.5e-4, end=7.5e-4)])
+    step = mpm.Step(
+        unit_box(), mpm.NeoHookean(E=1e4, nu=0.3), boundaries=[mpm.Sphere(path, 0.15, start=2.5e-4, end=7.5e-4)]
+    )
     assert in_one_op(step, state)
     expected = one_by_one(step, state, 10, DT)
     asked.clear()
@@ -225,7 +226,7 @@ def test_a_path_has_no_gradient_where_the_obstacle_is_not(device):
     """Beside a start at which its speed is infinite."""
     bend = torch.tensor(2.0, dtype=F64, device=device, requires_grad=True)
     path = lambda t: torch.stack([0.4 + bend * (t - 3.5e-4).sqrt(), 0.5 + 0 * t])  # noqa: E731
-    step = mpm.Step(box(2), mpm.NeoHookean(E=1e4, nu=0.3), boundaries=[mpm.Sphere(path, 0.15, start=3.5e-4)])
+    step = mpm.Step(unit_box(2), mpm.NeoHookean(E=1e4, nu=0.3), boundaries=[mpm.Sphere(path, 0.15, start=3.5e-4)])
     state = blob(device, 2)
     ends = mpm.rollout(step, state, 8, DT, 3), one_by_one(step, state, 8, DT)
     found = [torch.autograd.grad(end.x.square().sum(), bend)[0] for end in ends]
@@ -239,7 +240,7 @@ def test_clocks_of_float32_are_those_of_single_steps(device):
     state = blob(device, 2, dtype=torch.float32)
     state = state.replace(time=torch.full((1,), 8.0, device=device), v=0.01 * state.v)
     ball = mpm.Box(lambda t: torch.stack([0.3 + 20 * (t - 8), 0.5 + 0 * t], -1), (0.2, 0.3), angular_velocity=3.0)
-    step = mpm.Step(box(2), mpm.NeoHookean(E=1e3, nu=0.3), boundaries=[ball])
+    step = mpm.Step(unit_box(2), mpm.NeoHookean(E=1e3, nu=0.3), boundaries=[ball])
     dt = torch.full((1,), 1e-5, device=device)
     end, expected = mpm.rollout(step, state, 400, dt), one_by_one(step, state, 400, dt)
     assert torch.equal(end.time, expected.time)
@@ -290,7 +291,7 @@ def trained(dim: int, device: str) -> list[mpm.boundaries.Obstacle]:
 @pytest.mark.parametrize("transfer", SOME_TRANSFERS)
 def test_gradients_of_obstacles(every, transfer, dim, device):
     options = {"boundaries": trained(dim, device), **TRANSFERS[transfer]}
-    step = mpm.Step(box(dim), mpm.NeoHookean(E=1e4, nu=0.3), **options)
+    step = mpm.Step(unit_box(dim), mpm.NeoHookean(E=1e4, nu=0.3), **options)
     state = moving(step, blob(device, dim))
     got, expected = gradients(in_op(every, 7), step, state), gradients(single(7), step, state)
     assert sum(name.startswith("boundaries") for name in expected) == 9
@@ -306,7 +307,7 @@ def test_gradients_of_obstacles_of_scenes(with_impulse, dim, device):
     shared, own = trained(dim, device)
     own.position = torch.nn.Parameter(0.36 + 0.02 * torch.rand(scenes, dim, dtype=F64, device=device))
     shared.velocity = torch.nn.Parameter(2.0 * torch.rand(scenes, dim, dtype=F64, device=device))
-    step = mpm.Step(box(dim, scenes=scenes), mpm.NeoHookean(E=1e4, nu=0.3), boundaries=[shared, own])
+    step = mpm.Step(unit_box(dim, scenes=scenes), mpm.NeoHookean(E=1e4, nu=0.3), boundaries=[shared, own])
     scene = (torch.arange(300, device=device) % scenes).int()
     state = moving(step, blob(device, dim).replace(scene=scene))
     state = step.with_impulses(state) if with_impulse else state
@@ -323,7 +324,7 @@ def test_gradients_of_paths(path, every, dim, device):
     bend = torch.tensor(0.3, dtype=F64, device=device, requires_grad=True)
     function = lambda t: torch.stack([0.45 + bend * torch.sin(40 * t), *swinging(t)[1:dim]], -1)  # noqa: E731
     step = mpm.Step(
-        box(dim), mpm.NeoHookean(E=1e4, nu=0.3), boundaries=bodies(dim, way if path == "waypoints" else function)
+        unit_box(dim), mpm.NeoHookean(E=1e4, nu=0.3), boundaries=bodies(dim, way if path == "waypoints" else function)
     )
     state, wanted = moving(step, blob(device, dim)), way.position if path == "waypoints" else bend
     found = []
@@ -343,7 +344,7 @@ def test_the_gradient_of_a_controlled_path_is_that_of_finite_differences(device)
 
     def reached(points: Tensor) -> Tensor:
         ball = mpm.Sphere(mpm.Waypoints(time, points), 0.15, "sticky")
-        end = mpm.rollout(mpm.Step(box(2), mpm.NeoHookean(E=1e4, nu=0.3), boundaries=[ball]), state, 20, DT)
+        end = mpm.rollout(mpm.Step(unit_box(2), mpm.NeoHookean(E=1e4, nu=0.3), boundaries=[ball]), state, 20, DT)
         return end.v.square().sum()
 
     control = points.clone().requires_grad_()
@@ -357,7 +358,7 @@ def test_the_gradient_of_a_controlled_path_is_that_of_finite_differences(device)
 
 def test_the_op_itself_with_tables_of_all_steps(device):
     """Fake kernel, autograd and schema."""
-    step = mpm.Step(box(2), mpm.NeoHookean(E=1e4, nu=0.3), boundaries=bodies(2, smooth(2, device)))
+    step = mpm.Step(unit_box(2), mpm.NeoHookean(E=1e4, nu=0.3), boundaries=bodies(2, smooth(2, device)))
     state = step.prepare(blob(device, 2, 40))
     arguments = mpm.substeps_arguments(step, state, 3, DT)
     assert list(arguments["obstacles"].shape) == [3, 1, 3, 10]

@@ -2,10 +2,10 @@
 
 import pytest
 import torch
-from cases.steps import block_state, make_step
 from helpers import relative_error
 
 import torch_mpm as mpm
+from benchmarks.catalogue.scenes import block_state, make_step
 
 N, DT = 12, 1e-3
 GRAVITY = (0.0, -9.8)

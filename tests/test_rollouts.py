@@ -9,21 +9,19 @@ from cases.rollouts import (
     TRANSFERS,
     WALLS,
     assert_equal,
-    blob,
-    box,
     each_scene,
     flying,
     in_one_op,
     mixture,
     one_by_one,
     tensors,
-    touched,
 )
 from combinations import DT, F64, draw, make
 from helpers import TOLERANCE, OpNames
 from torch import Tensor
 
 import torch_mpm as mpm
+from benchmarks.catalogue.scenes import blob, touched, unit_box
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -53,7 +51,7 @@ def test_random_simulations_are_taken_in_one_op(device):
 def test_laws(law, n, transfer, dim, dtype, device):
     """On CUDA the law of a step in float32 is part of P2G, and from 14 steps on some are replayed."""
     options = {"gravity": (0.0, -9.8, 0.0)[:dim], "walls": "separate", **TRANSFERS[transfer]}
-    step = mpm.Step(box(dim), LAWS_HERE[law](), **options)
+    step = mpm.Step(unit_box(dim), LAWS_HERE[law](), **options)
     state = blob(device, dim, dtype=dtype)
     state.x[5] = -3.0  # and outside the grid the law acts, too
     assert in_one_op(step, state)
@@ -73,7 +71,7 @@ def test_laws(law, n, transfer, dim, dtype, device):
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
 def test_transfers(transfer, form, kernel, walls, dtype, device):
     options = {"stress_form": form, "walls": touched(walls, 3), **TRANSFERS[transfer]}
-    step = mpm.Step(box(kernel=kernel), mpm.NeoHookean(E=1e4, nu=0.3), (0.0, -9.8, 0.0), **options)
+    step = mpm.Step(unit_box(kernel=kernel), mpm.NeoHookean(E=1e4, nu=0.3), (0.0, -9.8, 0.0), **options)
     state = blob(device, dtype=dtype)
     assert in_one_op(step, state)
     with torch.no_grad():
@@ -89,7 +87,7 @@ def test_particles_leave_the_blocks_they_were_found_in(dim, device, cells, kerne
     """`cells` per step at which a cloud moves and parts: some stay in the blocks of the first step, some go to others
     that are active, or to others yet. On CUDA blocks are not found anew in every step."""
     n, dt = 40 if cells < 1 else 6, 1e-4
-    step = mpm.Step(box(dim, dx=1 / 64, kernel=kernel), LAWS_HERE["sand"](), walls="slip", **TRANSFERS[transfer])
+    step = mpm.Step(unit_box(dim, dx=1 / 64, kernel=kernel), LAWS_HERE["sand"](), walls="slip", **TRANSFERS[transfer])
     state = blob(device, dim, 3000, dtype=dtype)
     v = state.v * 0.2 + torch.tensor([1.0, -0.6, 0.3][:dim], dtype=dtype, device=device)
     state = step.prepare(state.replace(v=v * (cells * step.grid.dx / dt)))
@@ -110,7 +108,7 @@ def streams(dim: int, device: str, transfer: str = "apic") -> tuple[mpm.Step, mp
     others = [LAWS_HERE[name]() for name in ("fluid", "sand", "viscoelastic")]
     laws = mpm.Mixture([mpm.NeoHookean(E=stiffness, nu=0.3), *others])
     ball = mpm.Sphere((0.5,) * dim, 0.1, velocity=(0.0, 4.0, 0.0)[:dim])
-    grid = box(dim, dx=1 / 32, scenes=2, max_blocks=2 * 10**dim)  # on CUDA no pool grows within a call
+    grid = unit_box(dim, dx=1 / 32, scenes=2, max_blocks=2 * 10**dim)  # on CUDA no pool grows within a call
     step = mpm.Step(grid, laws, boundaries=[ball], **TRANSFERS[transfer])
     state, scene = blob(device, dim, count), torch.randint(0, 2, (count,), generator=g).int().to(device)
     there = torch.tensor([1.0, -0.6, 0.3][:dim], dtype=F64, device=device) * (1 - 2 * scene)[:, None]
@@ -145,7 +143,7 @@ def test_threads_change_nothing(dim, law, transfer):
     if law == "mixture":
         step, state = streams(dim, "cpu", transfer)
     else:
-        step = mpm.Step(box(dim, dx=1 / 32), LAWS_HERE[law](), walls="slip", **TRANSFERS[transfer])
+        step = mpm.Step(unit_box(dim, dx=1 / 32), LAWS_HERE[law](), walls="slip", **TRANSFERS[transfer])
         state = step.prepare(blob("cpu", dim, 3000, dtype=torch.float32))
         state = state.replace(v=200 * state.v)
     ends = []
@@ -169,7 +167,7 @@ def test_scenes_whose_particles_leave_the_domain(dim, device, walls, transfer):
     ball = mpm.Sphere((0.5,) * dim, 0.15, velocity=(0.0, 4.0, 0.0)[:dim], end=0.01)
     options = {"walls": walls, "boundaries": [ball], **TRANSFERS[transfer]}
     blocks = {2: 100, 3: 400}[dim]  # on CUDA a pool that grows does so between calls
-    step = mpm.Step(box(dim, scenes=3, max_blocks=blocks), mpm.NeoHookean(E=1e3, nu=0.3), **options)
+    step = mpm.Step(unit_box(dim, scenes=3, max_blocks=blocks), mpm.NeoHookean(E=1e3, nu=0.3), **options)
     scene = torch.randint(0, 2, (400,), generator=torch.Generator().manual_seed(2)).int() * 2
     state = blob(device, dim, 400, scene=scene)
     v = 30 * state.v
@@ -178,7 +176,7 @@ def test_scenes_whose_particles_leave_the_domain(dim, device, walls, transfer):
     with torch.no_grad():
         end, statuses = mpm.rollout(step, state, 70, 2e-4), []
         statuses.append(step.failures(end))
-        again = mpm.Step(box(dim, scenes=3, max_blocks=blocks), step.law, **options)
+        again = mpm.Step(unit_box(dim, scenes=3, max_blocks=blocks), step.law, **options)
         expected = one_by_one(again, state, 70, 2e-4)
         statuses.append(again.failures(expected))
     assert str(statuses[0]) == str(statuses[1])
@@ -189,7 +187,7 @@ def test_scenes_whose_particles_leave_the_domain(dim, device, walls, transfer):
 
 def test_a_full_pool_is_reported_by_the_call_that_fills_it(device):
     """Also where the particles are still in blocks that are active for others."""
-    step = mpm.Step(box(2, max_blocks=4), mpm.NeoHookean(E=1e3, nu=0.3))
+    step = mpm.Step(unit_box(2, max_blocks=4), mpm.NeoHookean(E=1e3, nu=0.3))
     state = blob(device, 2, 200)
     state = state.replace(x=0.45 + 0.1 * state.x, v=300 * (state.x - 0.5))
     with torch.no_grad(), pytest.raises(mpm.GridOverflowError, match="max_blocks=4"):
@@ -199,7 +197,7 @@ def test_a_full_pool_is_reported_by_the_call_that_fills_it(device):
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
 def test_a_pool_that_was_too_small_for_some_steps_is_told_when_it_has_grown(device, dtype):
     """On CUDA the pool grows between calls; on the CPU within them, so that there is nothing to report."""
-    step = mpm.Step(box(2, dx=0.005), mpm.NeoHookean(E=1e3, nu=0.3), transfer="pic")
+    step = mpm.Step(unit_box(2, dx=0.005), mpm.NeoHookean(E=1e3, nu=0.3), transfer="pic")
     state = blob(device, 2, 200, dtype=dtype)
     state = state.replace(x=0.45 + 0.1 * state.x, v=1000 * (state.x - 0.5))
     with torch.no_grad():
@@ -219,7 +217,7 @@ def test_mixtures(transfer, dim, device):
     laws = mixture()
     state = blob(device, dim, 400, material=torch.randint(0, 7, (400,), dtype=torch.int32))
     state = state.replace(material=state.material.int(), ids=torch.randperm(400).to(device))
-    step = mpm.Step(box(dim), laws, gravity=(0.0, -9.8, 0.0)[:dim], walls="sticky", **TRANSFERS[transfer])
+    step = mpm.Step(unit_box(dim), laws, gravity=(0.0, -9.8, 0.0)[:dim], walls="sticky", **TRANSFERS[transfer])
     assert in_one_op(step, state)
     with torch.no_grad():
         for start in (state, step.prepare(state).sorted(step.grid)):
@@ -230,13 +228,13 @@ def test_a_material_without_a_law_is_refused(device):
     state = blob(device, material=torch.full((300,), 7, dtype=torch.int32))
     state = state.replace(material=state.material.int())
     with torch.no_grad(), pytest.raises(ValueError, match=r"material must be in 0 \.\. 6"):
-        mpm.rollout(mpm.Step(box(), mixture()), state, 2, 1e-4)
+        mpm.rollout(mpm.Step(unit_box(), mixture()), state, 2, 1e-4)
 
 
 @torch.no_grad()
 def test_materials_that_a_step_has_checked_stay_checked_when_it_sorts(device):
     """To check them is to wait for the device."""
-    step, number = mpm.Step(box(), mixture()), torch.arange(300, dtype=torch.int32, device=device)
+    step, number = mpm.Step(unit_box(), mixture()), torch.arange(300, dtype=torch.int32, device=device)
     state = mpm.rollout(step, blob(device).replace(material=number % 7), 2, 1e-4)
     for start, checked in ((step.sorted(state), False), (state.sorted(step.grid), True)):
         with OpNames() as names:
@@ -247,7 +245,7 @@ def test_materials_that_a_step_has_checked_stay_checked_when_it_sorts(device):
 
 @torch.no_grad()
 def test_materials_that_no_step_has_checked_are_checked_after_a_sort(device):
-    step, number = mpm.Step(box(), mixture()), torch.arange(300, dtype=torch.int32, device=device)
+    step, number = mpm.Step(unit_box(), mixture()), torch.arange(300, dtype=torch.int32, device=device)
     state = step.sorted(step.prepare(blob(device).replace(material=number % 8)))
     with pytest.raises(ValueError, match=r"material must be in 0 \.\. 6"):
         mpm.rollout(step, state, 2, 1e-4)
@@ -270,7 +268,7 @@ def test_batches_with_obstacles_and_parameters_of_scenes_and_particles(n, transf
     ]
     gravity = torch.randn(scenes, dim, dtype=F64, device=device)
     options = {"boundaries": obstacles, "walls": "slip", **TRANSFERS[transfer]}
-    step = mpm.Step(box(dim, scenes=scenes), law.to(device), gravity, **options)
+    step = mpm.Step(unit_box(dim, scenes=scenes), law.to(device), gravity, **options)
     assert in_one_op(step, state)
     with torch.no_grad():
         assert_equal(mpm.rollout(step, state, n, 1e-4), one_by_one(step, state, n, 1e-4))
@@ -285,7 +283,7 @@ def test_obstacles_come_and_go_in_the_substeps_of_single_steps(device):
         time += dt
     assert time < 0.8
     wall = {"kind": "sticky", "start": 0.8, "end": 1.5}
-    step = mpm.Step(box(), mpm.NeoHookean(E=1e-9, nu=0.3), boundaries=[mpm.Sphere((0.5,) * 3, 0.3, **wall)])
+    step = mpm.Step(unit_box(), mpm.NeoHookean(E=1e-9, nu=0.3), boundaries=[mpm.Sphere((0.5,) * 3, 0.3, **wall)])
     assert in_one_op(step, state)
     with torch.no_grad():
         for n in (8, 9, 10, 14, 15, 16, 17, 20):
@@ -298,7 +296,7 @@ def test_obstacles_come_and_go_in_the_substeps_of_single_steps(device):
 @pytest.mark.parametrize("transfer", SOME_TRANSFERS)
 def test_the_pool_grows_inside_the_op(transfer):
     state, dt = flying("cpu")
-    grid, other = box(dx=1 / 64), box(dx=1 / 64)
+    grid, other = unit_box(dx=1 / 64), unit_box(dx=1 / 64)
     law, options = mpm.NeoHookean(E=1.0, nu=0.3), TRANSFERS[transfer]
     with torch.no_grad():
         end = mpm.rollout(mpm.Step(grid, law, **options), state, 8, dt)
@@ -308,7 +306,7 @@ def test_the_pool_grows_inside_the_op(transfer):
 
 def test_a_full_pool_is_an_error_and_nothing_is_lost():
     state, dt = flying("cpu")
-    step = mpm.Step(box(dx=1 / 64, max_blocks=40), mpm.NeoHookean(E=1.0, nu=0.3))
+    step = mpm.Step(unit_box(dx=1 / 64, max_blocks=40), mpm.NeoHookean(E=1.0, nu=0.3))
     before = state.x.clone()
     with torch.no_grad(), pytest.raises(mpm.GridOverflowError, match="max_blocks=40"):
         mpm.rollout(step, state, 8, dt)
@@ -340,7 +338,7 @@ def test_problems_are_those_of_single_steps(device):
     x[5], x[7] = float("nan"), 3.0
     failures = []
     for move in (mpm.rollout, one_by_one):
-        step = mpm.Step(box(), mpm.NeoHookean(E=1e4, nu=0.3))
+        step = mpm.Step(unit_box(), mpm.NeoHookean(E=1e4, nu=0.3))
         with torch.no_grad():
             end = move(step, state.replace(x=x), 4, 1e-3)
             failures.append((step.status.cpu(), end.x.isfinite().all(1).cpu()))
@@ -353,7 +351,7 @@ def test_problems_are_those_of_single_steps(device):
 @pytest.mark.parametrize("transfer", SOME_TRANSFERS)
 def test_no_particles(obstacles, transfer, device):
     law = mpm.VonMises(E=1e4, nu=0.3, yield_stress=1.0)
-    step = mpm.Step(box(), law, gravity=(0.0, -1.0, 0.0), boundaries=obstacles, **TRANSFERS[transfer])
+    step = mpm.Step(unit_box(), law, gravity=(0.0, -1.0, 0.0), boundaries=obstacles, **TRANSFERS[transfer])
     with torch.no_grad():
         end = mpm.rollout(step, blob(device, count=0), 3, 1e-3)
         step.check(end)
@@ -365,19 +363,23 @@ def test_no_particles(obstacles, transfer, device):
 
 def test_reasons_to_step_from_python(device):
     state, law = blob(device), mpm.NeoHookean(E=1e4, nu=0.3)
-    bouncing = mpm.Step(box(), law, walls="mirror", flip=0.5)
+    bouncing = mpm.Step(unit_box(), law, walls="mirror", flip=0.5)
     reasons = {
-        "a tensor": (mpm.Step(box(), law), state, torch.tensor(1e-4, device=device)),
+        "a tensor": (mpm.Step(unit_box(), law), state, torch.tensor(1e-4, device=device)),
         "FLIP keeps a share of the impulses on mirrors": (bouncing, bouncing.with_impulses(state), 1e-4),
-        "on_grid": (mpm.Step(box(), law, on_grid=lambda b, v, m, dt: v), state, 1e-4),
-        "CustomLaw": (mpm.Step(box(), lambda F: F), state, 1e-4),
-        "QuarticSand": (mpm.Step(box(), mpm.QuarticSand(E=1e4, nu=0.3, hardening=(0.6, 0.1, 0.2, 0.1))), state, 1e-4),
+        "on_grid": (mpm.Step(unit_box(), law, on_grid=lambda b, v, m, dt: v), state, 1e-4),
+        "CustomLaw": (mpm.Step(unit_box(), lambda F: F), state, 1e-4),
+        "QuarticSand": (
+            mpm.Step(unit_box(), mpm.QuarticSand(E=1e4, nu=0.3, hardening=(0.6, 0.1, 0.2, 0.1))),
+            state,
+            1e-4,
+        ),
         "the time of the state requires a gradient": (
-            mpm.Step(box(), law, boundaries=[mpm.Sphere((0.5,) * 3, 0.1, end=1.0)]),
+            mpm.Step(unit_box(), law, boundaries=[mpm.Sphere((0.5,) * 3, 0.1, end=1.0)]),
             state.replace(time=torch.zeros(1, dtype=F64, device=device, requires_grad=True)),
             1e-4,
         ),
-        "boundary": (mpm.Step(box(), law, boundaries=[Still()]), state, 1e-4),
+        "boundary": (mpm.Step(unit_box(), law, boundaries=[Still()]), state, 1e-4),
     }
     for reason, (step, start, dt) in reasons.items():
         assert reason in step.explain(start, dt)
@@ -387,7 +389,7 @@ def test_nothing_that_may_have_a_gradient_is_lost(device):
     """Tensors of a user function are not detected; under no_grad there are no gradients."""
     stiffness = torch.tensor(1e4, dtype=F64, device=device, requires_grad=True)
     law = mpm.NeoHookean(mu=lambda temperature: stiffness + temperature, lam=1e3)
-    step, state = mpm.Step(box(), law), blob(device)
+    step, state = mpm.Step(unit_box(), law), blob(device)
     state = state.replace(temperature=torch.zeros_like(state.mass))
     assert "function" in step.explain(state, 1e-4)
     end = mpm.rollout(step, state, 2, 1e-4)
@@ -403,7 +405,7 @@ def test_a_step_of_the_users_own_is_called(device):
             state = super().forward(state, dt)
             return state.replace(v=0.5 * state.v)
 
-    step, state = Slower(box(), mpm.NeoHookean(E=1e4, nu=0.3)), blob(device)
+    step, state = Slower(unit_box(), mpm.NeoHookean(E=1e4, nu=0.3)), blob(device)
     assert "Slower" in step.explain(state, 1e-4)
     with torch.no_grad():
         assert_equal(mpm.rollout(step, state, 2, 1e-4), one_by_one(step, state, 2, 1e-4))
@@ -415,7 +417,7 @@ class Still:
 
 
 def test_hooks_are_called_for_every_step(device):
-    step, called = mpm.Step(box(), mpm.NeoHookean(E=1e4, nu=0.3)), []
+    step, called = mpm.Step(unit_box(), mpm.NeoHookean(E=1e4, nu=0.3)), []
     handle = step.law.register_forward_hook(lambda *arguments: called.append(1))
     with torch.no_grad():
         mpm.rollout(step, blob(device), 3, 1e-4)
@@ -479,7 +481,7 @@ def test_one_tensor_for_all_scenes(device, shape, paused):
         torch.testing.assert_close(end.time, expected.time)
         assert_equal(end.replace(time=0.0), expected.replace(time=0.0))
         state = end
-    again.law, again.grid = mpm.NeoHookean(E=1e4, nu=0.3), box()  # of one scene
+    again.law, again.grid = mpm.NeoHookean(E=1e4, nu=0.3), unit_box()  # of one scene
     alone = blob(device).replace(time=torch.zeros(shape, dtype=F64, device=device))
     assert again.explain(alone, dt).startswith("all steps in one op")
 
@@ -487,7 +489,7 @@ def test_one_tensor_for_all_scenes(device, shape, paused):
 @pytest.mark.parametrize("gradient", [False, True])
 def test_a_call_of_the_op_by_training_code(device, gradient):
     """With the arguments that `rollout` would give, some of them exchanged."""
-    step = mpm.Step(box(), mpm.NeoHookean(E=1e4, nu=0.3), gravity=(0.0, -9.8, 0.0), walls="separate")
+    step = mpm.Step(unit_box(), mpm.NeoHookean(E=1e4, nu=0.3), gravity=(0.0, -9.8, 0.0), walls="separate")
     state = blob(device)
     faster = (2 * state.v).requires_grad_(gradient)
     with torch.set_grad_enabled(gradient):
@@ -502,7 +504,7 @@ def test_a_call_of_the_op_by_training_code(device, gradient):
     names = [a.name for a in torch.ops.torch_mpm.substeps.default._schema.arguments]
     assert list(arguments) == names
     with pytest.raises(ValueError, match="substeps` supports, got a step that it does not: it calls on_grid"):
-        mpm.substeps_arguments(mpm.Step(box(), step.law, on_grid=lambda b, v, m, dt: v), state, 7, DT)
+        mpm.substeps_arguments(mpm.Step(unit_box(), step.law, on_grid=lambda b, v, m, dt: v), state, 7, DT)
 
 
 def test_a_law_with_its_own_update_is_not_replaced(device):
@@ -511,7 +513,7 @@ def test_a_law_with_its_own_update_is_not_replaced(device):
             fields, stress = super().update(state)
             return fields, 2 * stress
 
-    step = mpm.Step(box(), Doubled(E=1e4, nu=0.3))
+    step = mpm.Step(unit_box(), Doubled(E=1e4, nu=0.3))
     assert "Doubled is more than a compiled law" in step.explain(blob(device))
 
 
@@ -519,7 +521,7 @@ def test_the_raw_op(device):
     state = blob(device, count=40)
     x, scalar = state.x, torch.tensor(2e3, dtype=F64, device=device)
     eye = torch.eye(3, dtype=F64, device=device).repeat(40, 1, 1)
-    grid = box(max_blocks=64)
+    grid = unit_box(max_blocks=64)
     particles = (x, state.v, state.mass, state.volume, None, eye, None, 1e-9 * x, [state.mass * 0], *[None] * 4)
     law = ("von_mises", [0], [scalar, scalar, 0.01 * scalar, scalar], [1])
     rest = (
@@ -571,7 +573,7 @@ def test_ten_deterministic_runs_are_the_same_to_the_last_bit(law, scenes, transf
     one = blob(device, count=150, dtype=torch.float32)
     scene = torch.arange(scenes, dtype=torch.int32, device=device)
     state = mpm.State.concatenate([one.replace(scene=scene[k].expand(len(one))) for k in range(scenes)])
-    grid = box(deterministic=True, scenes=scenes)
+    grid = unit_box(deterministic=True, scenes=scenes)
     options = {"gravity": (0, -9.8, 0), "walls": "slip", **TRANSFERS[transfer]}
 
     def run(with_gradient: bool) -> list[Tensor]:

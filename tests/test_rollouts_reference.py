@@ -2,12 +2,12 @@
 
 import pytest
 import torch
-from cases.steps import block_state
 from helpers import TOLERANCE, relative_error
 from oracle import advance, contact, grid_update, material, sand, transfer
 from torch import Tensor
 
 import torch_mpm as mpm
+from benchmarks.catalogue.scenes import block_state
 from torch_mpm.grid.topology import PADDING
 
 F64 = torch.float64

@@ -6,10 +6,10 @@ Deterministic grids of few particles per scene always go that way there, others 
 import pytest
 import torch
 from cases.small_scenes import DT, F32, LAWS, N, assert_same, both, joined
-from cases.steps import block_state
 from helpers import relative_error
 
 import torch_mpm as mpm
+from benchmarks.catalogue.scenes import block_state
 
 
 def make(dim, scenes, law, dx=0.1, **options):

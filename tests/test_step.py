@@ -2,12 +2,12 @@
 
 import pytest
 import torch
-from cases.steps import block_state, make_step
 from helpers import TOLERANCE, random_particles, relative_error
 from oracle import grid_update as grid_reference
 from oracle import transfer as reference
 
 import torch_mpm as mpm
+from benchmarks.catalogue.scenes import block_state, make_step
 
 
 def mpm88(device):

@@ -5,12 +5,12 @@ import io
 import pytest
 import torch
 import torch.multiprocessing as mp
-from cases.steps import block_state, make_step
 from helpers import relative_error
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
 import torch_mpm as mpm
+from benchmarks.catalogue.scenes import block_state, make_step
 
 DT = 1e-3
 F64 = torch.float64

@@ -2,9 +2,9 @@
 
 import pytest
 import torch
-from cases.rollouts import blob, box
 
 import torch_mpm as mpm
+from benchmarks.catalogue.scenes import blob, unit_box
 
 CYCLES = 3_000_000_000
 """Clock cycles that keep a GPU busy for more than a second."""
@@ -15,17 +15,17 @@ def scene(kind: str, device: str) -> tuple[mpm.Step, mpm.State]:
     state = blob(device, 3, count, torch.float32)
     options: dict = {"gravity": (0.0, -9.8, 0.0), "walls": "separate"}
     law: mpm.Material = mpm.NeoHookean(E=1e4, nu=0.3)
-    grid = box(3)
+    grid = unit_box(3)
     if kind == "mixture":
         law = mpm.Mixture([law, mpm.QuarticSand(E=1e4, nu=0.3)])
         state = state.replace(material=(torch.arange(count, device=device) % 2).int())
         options["boundaries"] = [mpm.Sphere((0.5, 0.2, 0.5), 0.1, velocity=(0.1, 0.0, 0.0))]
     if kind in ("batch", "small scenes"):
         scenes = 8 if kind == "batch" else 100
-        grid = box(3, scenes=scenes)
+        grid = unit_box(3, scenes=scenes)
         state = state.replace(scene=(torch.arange(count, device=device) * scenes // count).int())
     if kind == "heat":  # whose replays wait for the block count of a growing pool
-        grid = box(3, max_blocks=200)
+        grid = unit_box(3, max_blocks=200)
         state = state.replace(temperature=torch.full_like(state.mass, 300.0))
     step = mpm.Step(grid, law, **options)
     if kind == "heat":

@@ -27,6 +27,7 @@ import torch_mpm as mpm
 from torch_mpm.implicit import Implicit
 
 from ..accuracy.runout import DENSITY, GRAVITY, stiffness
+from ..catalogue.scenes import short_bar
 from ..common import one_thread
 
 ENERGIES = ("full", "unilateral")
@@ -44,9 +45,7 @@ INTEGRATORS = {
 def cohesion() -> list[dict[str, Any]]:
     rows = []
     for E, dt in itertools.product((1e6, 1e7), (1e-3, 1e-2, 5e-2)):
-        grid = mpm.Grid(0.125, (0, 0), (2, 1.5))
-        points = mpm.seed.box((0.5, 0.5), (1.0, 0.75), grid, per_cell=4)
-        state = mpm.State.at_rest(points, density=1600.0, dtype=torch.float64)
+        grid, state = short_bar(2, density=1600.0)
         C = torch.zeros(len(state), 2, 2, dtype=torch.float64)
         C[:, 0, 0] = 2.0
         r = state.x - state.x.mean(0)

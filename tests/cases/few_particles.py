@@ -2,8 +2,8 @@
 
 import torch
 
+from benchmarks.catalogue.scenes import block_state
 from cases.small_scenes import F64
-from cases.steps import block_state
 
 
 def body(dim, device="cpu", speed=3.0, **options):

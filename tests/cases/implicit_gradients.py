@@ -3,6 +3,7 @@
 import torch
 
 import torch_mpm as mpm
+from benchmarks.catalogue.scenes import block
 from torch_mpm.implicit import Implicit
 
 TIGHT = {"tolerance": 1e-12, "adjoint_tolerance": 1e-12}
@@ -12,8 +13,7 @@ NAMES = ("x", "v", "F", "C", "mass", "volume", "mu", "lam", "gravity", "dt")
 def inputs(dim, device, dtype=torch.float64):
     """A deformed block on the floor, with all that a step reads."""
     grid = mpm.Grid(0.25, (0,) * dim, (1.5,) * dim)
-    points = mpm.seed.box((0.25, 0.0, 0.25)[:dim], (0.75, 0.5, 0.5)[:dim], grid, per_cell=2**dim)
-    state = mpm.State.at_rest(points, density=1000.0, dtype=torch.float64)
+    state = block((0.25, 0.0, 0.25)[:dim], (0.75, 0.5, 0.5)[:dim], grid)
 
     def normal(*shape):
         return torch.randn(*shape, dtype=torch.float64)

@@ -42,10 +42,6 @@ def cloud(dim: int, device: str = "cpu", scenes: int = 1, count: int = 120, dtyp
     return state.to(device, dtype)
 
 
-def grid_of(dim: int, **options) -> mpm.Grid:
-    return mpm.Grid(0.1, (0.0,) * dim, (1.0,) * dim, **options)
-
-
 def one_by_one(step: mpm.Step, state: mpm.State, n: int = STEPS, dt: float | Tensor = DT) -> mpm.State:
     for _ in range(n):
         state = step(state, dt)

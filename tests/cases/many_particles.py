@@ -2,8 +2,8 @@
 
 import torch
 
+from benchmarks.catalogue.scenes import block_state
 from cases.small_scenes import F64
-from cases.steps import block_state
 
 CELLS = {"cpu": {2: 64, 3: 24}, "cuda": {2: 528, 3: 72}}
 N = 24

@@ -7,10 +7,7 @@ from helpers import TOLERANCE
 from torch import Tensor
 
 import torch_mpm as mpm
-from cases.rollouts import (
-    one_by_one,
-    tensors,
-)
+from cases.rollouts import one_by_one, tensors
 
 F64 = torch.float64
 DT, STEPS = 1e-4, 5

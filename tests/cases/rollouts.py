@@ -9,6 +9,7 @@ from torch import Tensor
 
 import torch_mpm as mpm
 from benchmarks.catalogue.laws import having, named
+from benchmarks.catalogue.scenes import blob, unit_box
 
 SEEDS = range(40)
 
@@ -52,24 +53,6 @@ def assert_close(value: Tensor, expected: Tensor, name: str, share: float) -> No
     assert float(error.quantile(share)) < 3e-2 * scale, f"{name}: {share:.0%} of the particles"
 
 
-def blob(device: str, dim: int = 3, count: int = 300, dtype: torch.dtype = F64, **fields) -> mpm.State:
-    g = torch.Generator().manual_seed(3)
-    x = 0.3 + 0.4 * torch.rand(count, dim, generator=g, dtype=F64)
-    v = torch.randn(count, dim, generator=g, dtype=F64)
-    ones = torch.ones(count, dtype=F64)
-    state = mpm.State(x=x, v=v, mass=1e-3 * ones, volume=1e-6 * ones, **fields)
-    return state.to(device, dtype)
-
-
-def touched(kind: str, dim: int) -> mpm.Walls:
-    """Walls that the blob is in."""
-    return mpm.Walls(kind, lower=(0.3125,) * dim, upper=(0.6875,) * dim)
-
-
-def box(dim: int = 3, dx: float = 0.0625, **options) -> mpm.Grid:
-    return mpm.Grid(dx=dx, lower=(0.0,) * dim, upper=(1.0,) * dim, **options)
-
-
 LAWS_HERE = having("compiled") | named("sand_keep")
 """Laws that the op of rollouts computes."""
 TRANSFERS = {
@@ -100,7 +83,12 @@ def each_scene(device: str, dtype: torch.dtype = F64, transfer: str = "apic") ->
     ball = mpm.Sphere((0.5, 0.2), 0.2, velocity=(0.0, 2.0), friction=0.2)
     late = mpm.Box((0.3, 0.5), (0.2, 0.2), start=2.5 * DT, kind="sticky")
     step = mpm.Step(
-        box(2, scenes=3), LAWS_HERE["herschel_bulkley"](), (0.5, -9.8), "separate", [ball, late], **TRANSFERS[transfer]
+        unit_box(2, scenes=3),
+        LAWS_HERE["herschel_bulkley"](),
+        (0.5, -9.8),
+        "separate",
+        [ball, late],
+        **TRANSFERS[transfer],
     )
     scene = (torch.arange(300) % 3).int().to(device)
     state = blob(device, 2, dtype=dtype).replace(scene=scene)

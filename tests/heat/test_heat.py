@@ -8,6 +8,7 @@ from cases.heat import FLOAT, NAN, block, check_gradients, grid_around, random_l
 from helpers import OpNames, relative_error
 
 import torch_mpm as mpm
+from benchmarks.catalogue import scenes
 from torch_mpm.heat.boundaries import Convection, Fixed, FixedSurface, Flux, FreeSurface, Radiation, Source, Surface
 from torch_mpm.laws.parameters import PerMaterial
 
@@ -127,7 +128,7 @@ def test_heated_bar():
     errors = []
     for n in (16, 32):
         dx, time = 1 / n, 0.1
-        bar = mpm.State.at_rest(mpm.seed.box((0, 0), (1, 2 * dx), dx, per_cell=4), 1.0, dtype=FLOAT)
+        bar = scenes.block((0, 0), (1, 2 * dx), dx, density=1.0)
         x = bar.x[:, 0].clone()
         shift = torch.tensor([0.37 * dx, 0.0], dtype=FLOAT)
         bar = bar.replace(x=bar.x + shift, temperature=torch.zeros_like(x))
@@ -179,7 +180,7 @@ def test_radiation_is_implicit_to_first_order():
 def test_fixed_ends_give_a_linear_profile(device):
     """Held by an obstacle at one end and by a function of positions at the other; time-dependent temperature."""
     dx = 1 / 8
-    bar = mpm.State.at_rest(mpm.seed.box((-2 * dx, 0), (1 + 2 * dx, 0.25), dx, per_cell=4), 1.0, dtype=FLOAT).to(device)
+    bar = scenes.block((-2 * dx, 0), (1 + 2 * dx, 0.25), dx, density=1.0, device=device)
     bar = bar.replace(temperature=torch.zeros_like(bar.mass))
     terms = [
         Fixed(mpm.Plane((0.0, 0.0), (1.0, 0.0)), lambda time: 2.0 + 0 * time),
@@ -196,7 +197,7 @@ def test_fixed_ends_give_a_linear_profile(device):
 def test_stand_off_of_held_nodes(kernel, offset):
     """A bar that ends at a wall on nodes, with flux 1 at its other end: the wall seems to be `offset` dx behind."""
     dx = 1 / 16
-    bar = mpm.State.at_rest(mpm.seed.box((0, 0), (1, 2 * dx), dx, per_cell=4), 1.0, dtype=FLOAT)
+    bar = scenes.block((0, 0), (1, 2 * dx), dx, density=1.0)
     bar = bar.replace(temperature=bar.x[:, 0].clone())
     heights = (torch.arange(4, dtype=FLOAT) + 0.5) * dx / 2
     flux = Flux(Surface(torch.stack([torch.ones_like(heights), heights], 1), dx / 2), 1.0)
@@ -258,7 +259,7 @@ def stefan_front(n, stefan, transfer="hybrid", r=0.2):
     """Relative error of the front of one-phase melting, s = 2 λ √(α t), by the latent heat taken up."""
     wanted = {0.1: 0.2200163, 0.5: 0.4647859, 1.0: 0.6200626}[stefan]
     dx = 1 / n
-    bar = mpm.State.at_rest(mpm.seed.box((0, 0), (1, dx), dx, per_cell=4), 1.0, dtype=FLOAT)
+    bar = scenes.block((0, 0), (1, dx), dx, density=1.0)
     bar = bar.replace(temperature=torch.zeros_like(bar.mass))
     hot = Fixed(mpm.Plane((0.0, 0.0), (1.0, 0.0)), 1.0)
     grid = mpm.Grid(dx, (-0.5, -0.5), (1.5, 0.5))

@@ -7,6 +7,7 @@ from cases.heat import FLOAT, block, grid_around
 from helpers import relative_error
 
 import torch_mpm as mpm
+from benchmarks.catalogue import scenes
 from torch_mpm.laws.parameters import evaluate
 
 KNOTS, VALUES = [0.0, 10.0, 50.0], [2e4, 1e4, 1e3]
@@ -150,7 +151,7 @@ def test_bar_between_walls_is_under_pressure_and_a_free_one_is_not():
     """The same in a rollout: 2-D, ν = 0, so that the stress along the bar is −E α ΔT for any motion across it."""
     E, alpha, rise = 1e5, 1e-4, 50.0
     law = mpm.ThermalExpansion(mpm.NeoHookean(E=E, nu=0.0), alpha)
-    bar = mpm.State.at_rest(mpm.seed.box((0, 0.4), (1, 0.6), 0.1, per_cell=4), 1000.0, dtype=torch.float64)
+    bar = scenes.block((0, 0.4), (1, 0.6), 0.1)
     bar = bar.replace(temperature=torch.full_like(bar.mass, rise))
     for lower, expected in ((0.0, -E * alpha * rise), (-1.0, 0.0)):
         step = mpm.Step(mpm.Grid(0.1, (lower, 0), (1 - lower, 1)), law, walls="slip", transfer="pic")

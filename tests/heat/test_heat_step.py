@@ -11,6 +11,7 @@ from helpers import relative_error
 
 import torch_mpm as mpm
 from benchmarks import common, report
+from benchmarks.catalogue import scenes
 from benchmarks.stability import heat_step
 from benchmarks.stability.heat_step import LIMIT, TRANSFERS, Case, matrix, measure
 from torch_mpm.heat.boundaries import Convection, Fixed, FixedSurface, FreeSurface, Source
@@ -86,7 +87,7 @@ def two_materials(n, contrast, r, transfer="hybrid", time=0.02):
         middle = (low + high) / 2
         low, high = (middle, high) if flux(middle) > 0 else (low, middle)
     w, v, dx = low, low / math.sqrt(contrast), 1 / n
-    bar = mpm.State.at_rest(mpm.seed.box((0, 0), (1, 2 * dx), dx, per_cell=4), 1.0, dtype=FLOAT)
+    bar = scenes.block((0, 0), (1, 2 * dx), dx, density=1.0)
     x = bar.x[:, 0].clone()
     left, scale = x < 0.5, math.cos(w / 2) / math.cos(v / 2)
     theta = torch.where(left, torch.cos(w * x), scale * torch.cos(v * (1 - x)))

@@ -5,6 +5,7 @@ import torch
 from helpers import relative_error
 
 import torch_mpm as mpm
+from benchmarks.catalogue.scenes import block
 from torch_mpm.implicit import Implicit, compare, equilibrium
 
 SOLID, FLUID = 0, 1
@@ -16,8 +17,7 @@ def beside(dim, device="cpu", dtype=torch.float64, corner=0.5, scenes=1):
     """A deformed solid and a compressed fluid that share nodes, moving."""
     grid = mpm.Grid(0.125, (0,) * dim, (2.0,) + (1.5,) * (dim - 1), scenes=scenes, deterministic=True)
     lower = (corner,) * dim
-    points = mpm.seed.box(lower, (corner + 0.5,) + (corner + 0.25,) * (dim - 1), grid, per_cell=2**dim)
-    state = mpm.State.at_rest(points, density=1000.0, dtype=torch.float64)
+    state = block(lower, (corner + 0.5,) + (corner + 0.25,) * (dim - 1), grid)
     material = (state.x[:, 0] > corner + 0.25).int()
     F = torch.eye(dim, dtype=torch.float64) + 0.05 * torch.randn(len(state), dim, dim, dtype=torch.float64)
     C = 0.5 * torch.randn(dim, dim, dtype=torch.float64)
@@ -184,8 +184,7 @@ def test_half_of_a_symmetric_scene(device):
     """Rubber over water whose halves part, and the right half beside a mirror, whose images the solve has not all."""
     middle = 1.0
     grid = mpm.Grid(0.125, (0.0, 0.0), (2.0, 1.0))
-    points = mpm.seed.box((0.75, 0.25), (1.25, 0.5), grid, per_cell=4)
-    whole = mpm.State.at_rest(points, density=1000.0, dtype=torch.float64, device=device)
+    whole = block((0.75, 0.25), (1.25, 0.5), grid, device=device)
     away = whole.x[:, 0] - middle
     # The solid touches the plane of the mirror and not all of the nodes whose images it touches.
     solid = (away.abs() > 0.08) & (whole.x[:, 1] > 0.35)
@@ -346,8 +345,7 @@ def test_gradients_with_the_flow_inside(device):
 def test_gradcheck_of_a_step(solids, dim, device):
     """Through v and the deformations of a fluid and one or two solids, of every entry of the results."""
     grid = mpm.Grid(0.5, (0.0,) * dim, (1.0,) * dim)
-    points = mpm.seed.box((0.25,) * dim, (0.75, 0.5, 0.5)[:dim], grid, per_cell=2**dim)
-    state = mpm.State.at_rest(points, density=1000.0, dtype=torch.float64, device=device)
+    state = block((0.25,) * dim, (0.75, 0.5, 0.5)[:dim], grid, device=device)
     eye = torch.eye(dim, dtype=torch.float64, device=device)
     material = torch.arange(len(state), device=device).remainder(1 + solids).int()
     v, F = torch.randn_like(state.v), eye + 0.05 * torch.randn(len(state), dim, dim, dtype=torch.float64).to(device)
@@ -412,8 +410,7 @@ def test_the_limit_is_that_of_the_explicit_materials(dim, device):
 def test_steps_of_the_full_limit_are_stable(stress_form, E, device):
     """The energy of a closed box with both materials mixed at random never exceeds what it was."""
     grid = mpm.Grid(0.1, (0.0, 0.0), (1.0, 1.0))
-    points = mpm.seed.box((0.0, 0.0), (1.0, 0.5), grid, per_cell=4)
-    state = mpm.State.at_rest(points, density=1000.0, dtype=torch.float64)
+    state = block((0.0, 0.0), (1.0, 0.5), grid)
     state = state.replace(v=0.5 * torch.randn_like(state.v), material=(torch.rand(len(state)) < 0.5).int()).to(device)
     law = mixture(E=E, K=1e4)
     step = mpm.Step(grid, law, walls="slip", stress_form=stress_form, integrator=Implicit(explicit=[FLUID]))

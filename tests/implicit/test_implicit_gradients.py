@@ -9,6 +9,7 @@ from helpers import relative_error
 from torch.autograd.graph import saved_tensors_hooks
 
 import torch_mpm as mpm
+from benchmarks.catalogue.scenes import block
 from torch_mpm.implicit import Implicit, equilibrium
 
 
@@ -220,8 +221,7 @@ def test_a_solve_of_the_adjoint_that_fails_is_told(device):
 def test_stiffness_from_the_sag_of_a_column(device):
     """u is proportional to 1/E: d u/dE = −u/E, and one Newton step of ln E finds the stiffness that gives a sag."""
     grid = mpm.Grid(0.125, (0, 0), (0.75, 1.5))
-    points = mpm.seed.box((0.25, 0.0), (0.5, 1.0), grid, per_cell=4)
-    state = mpm.State.at_rest(points, density=1000.0, dtype=torch.float64, device=device)
+    state = block((0.25, 0.0), (0.5, 1.0), grid, device=device)
 
     def sag(log_E):
         law = mpm.Hencky(E=log_E.exp(), nu=0.0)

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 import torch_mpm as mpm
+from benchmarks.catalogue.scenes import block
 from torch_mpm.implicit import Implicit, equilibrium
 
 DX, MIDDLE = 0.125, 1.0
@@ -31,8 +32,7 @@ def test_half_of_a_symmetric_scene(case, device):
     """A block on a rough floor whose halves part, and the right half beside a mirror, in two scenes of one batch."""
     law, options, obstacles = CASES[case]
     grid = mpm.Grid(DX, (0.0, 0.0), (2.0, 1.0), scenes=2)
-    points = mpm.seed.box((0.75, 0.0), (1.25, 0.25), grid, per_cell=4)
-    whole = mpm.State.at_rest(points, density=1000.0, dtype=torch.float64, device=device)
+    whole = block((0.75, 0.0), (1.25, 0.25), grid, device=device)
     whole = whole.replace(v=torch.stack([0.5 * (whole.x[:, 0] - MIDDLE), 0 * whole.x[:, 0]], 1))
     right = (whole.x[:, 0] > MIDDLE).nonzero()[:, 0]
     floor = ("separate", "open"), (0.0, (0.2, 0.0))
@@ -60,8 +60,7 @@ def test_a_column_on_a_mirror_is_of_second_order(stress_form, kernel, device):
     def error(cells):
         dx = 1.0 / cells
         grid = mpm.Grid(dx, (0.0, 0.0), (8 * dx, 1.0 + 8 * dx), kernel=kernel)
-        points = mpm.seed.box((3 * dx, 0.0), (5 * dx, 1.0), grid, per_cell=4)
-        state = mpm.State.at_rest(points, density=1000.0, dtype=torch.float64, device=device)
+        state = block((3 * dx, 0.0), (5 * dx, 1.0), grid, device=device)
         walls = mpm.Walls(("open", ("mirror", "open")))
         step = mpm.Step(
             grid, mpm.Hencky(E=1e9, nu=0.0), (0.0, -1.0), walls, integrator=Implicit(1e-9), stress_form=stress_form

@@ -11,6 +11,7 @@ from helpers import relative_error
 
 import torch_mpm as mpm
 from benchmarks.catalogue.laws import having
+from benchmarks.catalogue.scenes import block
 from torch_mpm.implicit import Implicit, adjoint, equilibrium, implicit
 from torch_mpm.laws.compiled import CompiledLaw
 from torch_mpm.laws.parameters import Overlay
@@ -37,8 +38,7 @@ def name_of(law):
 def inputs(law, dim, device, dtype=torch.float64):
     """A block on the floor with all that a step reads: fields, history q, gravity, dt, parameters."""
     grid = mpm.Grid(0.25, (0,) * dim, (2.0,) + (1.5,) * (dim - 1))
-    points = mpm.seed.box((0.5, 0.0, 0.5)[:dim], (1.0, 0.5, 0.75)[:dim], grid, per_cell=2**dim)
-    state = mpm.State.at_rest(points, density=1000.0, dtype=torch.float64)
+    state = block((0.5, 0.0, 0.5)[:dim], (1.0, 0.5, 0.75)[:dim], grid)
     P = len(state)
     stretch, rate = (torch.diag(torch.tensor(t[:dim]).double()) for t in ((0.92, 1.04, 0.98), (-3.0, 2.0, -0.5)))
 
@@ -350,8 +350,7 @@ def test_trial_stress_is_that_of_the_energy(law, dim, device):
 def test_a_static_sag_beyond_yield(device):
     """Column that flows under its weight; gradients by its strength against differences."""
     grid = mpm.Grid(0.125, (0, 0), (1.5, 1.5))
-    points = mpm.seed.box((0.5, 0.0), (0.75, 1.0), grid, per_cell=4)
-    state = mpm.State.at_rest(points, density=1000.0, dtype=torch.float64, device=device)
+    state = block((0.5, 0.0), (0.75, 1.0), grid, device=device)
 
     def sag(strength, hardening):
         law = mpm.VonMises(E=1e6, nu=0.3, yield_stress=strength, hardening=hardening)

@@ -9,6 +9,7 @@ from helpers import relative_error
 
 import torch_mpm as mpm
 from benchmarks.catalogue.laws import having, named
+from benchmarks.catalogue.scenes import block, short_bar
 from torch_mpm.implicit import Implicit
 from torch_mpm.implicit.system import ImplicitSystem
 from torch_mpm.laws.flowing import flowing_stress, flowing_tangent
@@ -21,11 +22,7 @@ ASSOCIATED = ("von_mises", "herschel_bulkley")
 
 
 def body(dim, device="cpu", dtype=torch.float64, per_cell=None):
-    """A block of 4 x 2 (x 2) cells in the middle of a box."""
-    grid = mpm.Grid(0.125, (0,) * dim, (2.0,) + (1.5,) * (dim - 1))
-    far = (1.0,) + (0.75,) * (dim - 1)
-    points = mpm.seed.box((0.5,) + (0.5,) * (dim - 1), far, grid, per_cell=per_cell or 2**dim)
-    return grid, mpm.State.at_rest(points, density=1600.0, dtype=dtype, device=device)
+    return short_bar(dim, device, dtype, density=1600.0, per_cell=per_cell)
 
 
 def pulled(state, rate):
@@ -125,8 +122,7 @@ def test_sand_that_is_pulled_apart_bears_no_tension(energy, dim, device):
 def tension(dim, steps, device, plasticity="inside", dtype=torch.float64):
     """A bar of von Mises' material between two clamps, pulled by 3% in a second: stress in its middle."""
     grid = mpm.Grid(0.125, (-0.5,) * dim, (3.0,) + (1.5,) * (dim - 1))
-    points = mpm.seed.box((0.0, 0.5, 0.5)[:dim], (1.5, 0.75, 0.75)[:dim], grid, per_cell=2**dim)
-    state = mpm.State.at_rest(points, density=1000.0, dtype=dtype, device=device)
+    state = block((0.0, 0.5, 0.5)[:dim], (1.5, 0.75, 0.75)[:dim], grid, dtype=dtype, device=device)
     law = mpm.VonMises(E=1e6, nu=0.3, yield_stress=1e4, hardening=1e4)
     along, back = (1.0, 0.0, 0.0)[:dim], (-1.0, 0.0, 0.0)[:dim]
     clamps = [

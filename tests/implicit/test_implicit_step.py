@@ -7,17 +7,10 @@ import torch
 from helpers import relative_error
 
 import torch_mpm as mpm
+from benchmarks.catalogue.scenes import block, short_bar
 from torch_mpm.implicit import Implicit, equilibrium
 
 EPS = {torch.float32: 1.2e-7, torch.float64: 2.3e-16}
-
-
-def bar(dim, device="cpu", dtype=torch.float64, dx=0.125, scenes=1, lower=0.5):
-    """A block of 4 x 2 (x 2) cells in the middle of a box."""
-    grid = mpm.Grid(dx, (0,) * dim, (2.0,) + (1.5,) * (dim - 1), scenes=scenes)
-    far = (1.0,) + (lower + 0.25,) * (dim - 1)
-    points = mpm.seed.box((0.5,) + (lower,) * (dim - 1), far, grid, per_cell=2**dim)
-    return grid, mpm.State.at_rest(points, density=1000.0, dtype=dtype, device=device)
 
 
 def spinning(state, rate=2.0, velocity=0.3):
@@ -49,7 +42,7 @@ def step_of(grid, law):
 @pytest.mark.parametrize("stress_form", ["mls", "gradient"])
 def test_a_short_step_is_an_explicit_one(dim, stress_form, device):
     """The difference of one step is of second order in dt; ψ of both comes from the same law by other kernels."""
-    grid, state = bar(dim, device)
+    grid, state = short_bar(dim, device)
     state = stretched(spinning(state))
     law = mpm.NeoHookean(E=1e5, nu=0.3)
     differences = []
@@ -66,7 +59,7 @@ def test_a_short_step_is_an_explicit_one(dim, stress_form, device):
 def test_first_order_in_dt(device):
     """A bar that begins to vibrate, after the same time in 16, 32 and 64 implicit and many explicit steps; with FLIP,
     since each transfer of APIC damps a little."""
-    grid, state = bar(2, device)
+    grid, state = short_bar(2, device)
     wave = torch.sin(torch.pi * (state.x[:, 0] - state.x[:, 0].mean()) / 0.5)
     state = state.replace(v=torch.stack([0.2 * wave, 0 * wave], 1))
     law, time = mpm.NeoHookean(E=1e5, nu=0.3), 0.02
@@ -81,7 +74,7 @@ def test_first_order_in_dt(device):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_momentum_in_free_flight(dim, dtype, device):
     """Linear momentum to the tolerance. Backward Euler loses angular momentum: L changes by dt Σ v × m v* exactly."""
-    grid, state = bar(dim, device, dtype)
+    grid, state = short_bar(dim, device, dtype)
     state = stretched(spinning(state))
     step = mpm.Step(grid, mpm.NeoHookean(E=1e5, nu=0.3), integrator=Implicit(1e-9 if dtype == torch.float64 else 1e-5))
     nodes = {}
@@ -117,8 +110,7 @@ def test_column_under_its_weight(dim, law, device):
         dx = 1.0 / cells
         grid = mpm.Grid(dx, (0,) * dim, (6 * dx, 1.5) + (6 * dx,) * (dim - 2))
         ends = (2 * dx, 0.0) + (2 * dx,) * (dim - 2), (4 * dx, 1.0) + (4 * dx,) * (dim - 2)
-        points = mpm.seed.box(*ends, grid, per_cell=2**dim)
-        state = mpm.State.at_rest(points, density=1000.0, dtype=torch.float64, device=device)
+        state = block(*ends, grid, device=device)
         gravity = (0, -1.0, 0)[:dim]
         step = mpm.Step(grid, law(E=1e6, nu=0.0), gravity=gravity, walls="sticky", integrator=Implicit(1e-8))
         end = equilibrium(step, state, 1e3)
@@ -133,8 +125,7 @@ def test_sag_of_a_beam(dtype, device):
     """A cantilever in plane strain with ν = 0, after Timoshenko: w = q L⁴/(8 E I) + q L²/(2 κ G A)."""
     h, E, g, dx = 0.1, 1e7, 0.5, 0.0125
     grid = mpm.Grid(dx, (-0.2, -0.4), (1.1, 0.4))
-    points = mpm.seed.box((-2 * dx, -h / 2), (1.0, h / 2), grid, per_cell=4)
-    state = mpm.State.at_rest(points, density=1000.0, dtype=dtype, device=device)
+    state = block((-2 * dx, -h / 2), (1.0, h / 2), grid, dtype=dtype, device=device)
     clamp = mpm.Plane((0.0, 0.0), (1.0, 0.0), kind="sticky")
     integrator = Implicit(1e-6 if dtype == torch.float64 else 1e-5)
     step = mpm.Step(grid, mpm.NeoHookean(E=E, nu=0.0), (0.0, -g), boundaries=[clamp], integrator=integrator)
@@ -152,7 +143,7 @@ def test_sag_of_a_beam(dtype, device):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_steps_far_beyond_the_explicit_limit(E, nu, cfl, dtype, device):
     """A stretched and spinning bar: every step converges, and its energy does not grow."""
-    grid, state = bar(2, device, dtype)
+    grid, state = short_bar(2, device, dtype)
     state = stretched(spinning(state, 0.5, 0.0), 0.2)
     law = mpm.NeoHookean(E=E, nu=nu)
     dt = min(cfl * float(mpm.stable_dt(grid, law, state, cfl=1.0)[0]), 0.5)
@@ -172,7 +163,7 @@ def test_steps_far_beyond_the_explicit_limit(E, nu, cfl, dtype, device):
 
 def test_contrast_of_a_million(device):
     """A stiff half on a soft one, by a modulus of each particle."""
-    grid, state = bar(2, device)
+    grid, state = short_bar(2, device)
     E = torch.where(state.x[:, 0] > state.x[:, 0].mean(), 1e9, 1e3)
     step = mpm.Step(grid, mpm.NeoHookean(E=E, nu=0.3), (0.0, -9.8), integrator="implicit")
     for _ in range(3):
@@ -188,7 +179,7 @@ def test_contrast_of_a_million(device):
 def test_walls_hold_in_the_solve(kind, dim, device):
     """A block falls on the floor: nodes there have the velocities that the wall allows, and the rest is in equilibrium:
     what is missing of the momentum is what the floor took."""
-    grid, state = bar(dim, device, lower=0.0)
+    grid, state = short_bar(dim, device, lower=0.0)
     down = torch.zeros(dim, dtype=torch.float64, device=device)
     down[0], down[1] = 0.5, -1.0
     state = state.replace(v=state.v + down)
@@ -217,7 +208,7 @@ def test_walls_hold_in_the_solve(kind, dim, device):
 
 def test_separate_lets_go(device):
     """A body that leaves a separating floor has no force from it; a slip floor would hold it."""
-    grid, state = bar(2, device, lower=0.0)
+    grid, state = short_bar(2, device, lower=0.0)
     state = state.replace(v=state.v + torch.tensor([0.0, 1.0], dtype=torch.float64, device=device))
     law = mpm.NeoHookean(E=1e5, nu=0.3)
     free, separate, slip = (
@@ -230,7 +221,7 @@ def test_separate_lets_go(device):
 @pytest.mark.parametrize("kind", ["sticky", "slip", "separate"])
 def test_moving_obstacles(kind, device):
     """An inclined plane that pushes the block: its nodes have its velocity, or no less along the normal."""
-    grid, state = bar(2, device)
+    grid, state = short_bar(2, device)
     n = torch.tensor([0.6, 0.8], dtype=torch.float64, device=device)
     velocity = (0.9, 0.4)
     plane = mpm.Plane((0.6, 0.55), (0.6, 0.8), kind=kind, velocity=velocity)
@@ -260,7 +251,7 @@ def test_moving_obstacles(kind, device):
 def test_what_moves_slowly_goes_on_as_it_did(device):
     """A block between two plates that close: after the first step the solve begins with the velocities before gravity,
     which saves most of it, and is as near to the solution."""
-    grid, state = bar(2, device, dx=0.0625)
+    grid, state = short_bar(2, device, dx=0.0625)
     ends = {"velocity": (0.01, 0.0), "kind": "sticky"}, {"velocity": (-0.01, 0.0), "kind": "sticky"}
     plates = [mpm.Plane((0.5, 0.0), (1.0, 0.0), **ends[0]), mpm.Plane((1.0, 0.0), (-1.0, 0.0), **ends[1])]
     law = mpm.NeoHookean(E=1e7, nu=0.3)
@@ -284,7 +275,7 @@ def test_what_moves_slowly_goes_on_as_it_did(device):
 
 def batch(device, scenes=3):
     """Bars of three stiffnesses, each with a dt of its own, stretched by different shares."""
-    grid, one = bar(2, device, scenes=scenes)
+    grid, one = short_bar(2, device, scenes=scenes)
     states = [stretched(spinning(one), 0.05 * (b + 1)) for b in range(scenes)]
     together = mpm.State.concatenate(
         [s.replace(scene=torch.full((len(s),), b).int().to(device)) for b, s in enumerate(states)]
@@ -334,7 +325,7 @@ def test_a_bad_scene_leaves_the_others_alone(device):
 
 def test_fluid_and_solid_in_one_step(device):
     """A mixture with a law of J: momentum is kept, and both laws move."""
-    grid, state = bar(2, device)
+    grid, state = short_bar(2, device)
     material = (state.x[:, 0] > state.x[:, 0].mean()).int()
     ratio = torch.where(material == 1, 0.95, 1.0).to(state.x)
     state = spinning(state.replace(material=material, J=ratio))
@@ -348,7 +339,7 @@ def test_fluid_and_solid_in_one_step(device):
 
 def test_viscosity_is_inside_the_solve(dim, device):
     """A short step is an explicit one to second order; a long one of a thick fluid ends shear and keeps momentum."""
-    grid, state = bar(dim, device)
+    grid, state = short_bar(dim, device)
     C = 0.5 * torch.randn(dim, dim, dtype=torch.float64).to(device)
     r = state.x - state.x.mean(0)
     state = state.replace(v=r @ C.T + 0.3, C=C.repeat(len(state), 1, 1))
@@ -378,7 +369,7 @@ def test_viscosity_is_inside_the_solve(dim, device):
 )
 def test_plastic_laws_flow_after_the_solve(law, device):
     """A block falls on the floor at 50 times the explicit limit; the next step begins with what has flowed."""
-    grid, state = bar(2, device, lower=0.0)
+    grid, state = short_bar(2, device, lower=0.0)
     state = state.replace(v=state.v + torch.tensor([0.0, -3.0], dtype=torch.float64, device=device))
     step = mpm.Step(grid, law, (0.0, -9.8), walls="sticky", integrator="implicit")
     flowed = False
@@ -393,8 +384,7 @@ def test_plastic_laws_flow_after_the_solve(law, device):
 def test_stiff_fluids_in_float32_never_pass_for_solved(device):
     """Where node blocks are rank one to rounding a residual of zero would be a lie."""
     grid = mpm.Grid(0.05, (0.0,) * 3, (1.0,) * 3)
-    points = mpm.seed.box((0.4,) * 3, (0.6, 0.6, 0.55), grid, per_cell=8)
-    state = mpm.State.at_rest(points, density=1000.0, dtype=torch.float32, device=device)
+    state = block((0.4,) * 3, (0.6, 0.6, 0.55), grid, dtype=torch.float32, device=device)
     generator = torch.Generator().manual_seed(0)
     state = state.replace(v=torch.randn(len(state), 3, generator=generator).to(device))
     step = mpm.Step(grid, mpm.WeaklyCompressible(2.2e9), integrator="implicit")
@@ -413,7 +403,7 @@ def test_no_scene(device):
 
 
 def test_an_equilibrium_does_not_conduct(device):
-    grid, state = bar(2, device)
+    grid, state = short_bar(2, device)
     heat = mpm.Heat(grid, conductivity=50.0, specific_heat=400.0)
     step = mpm.Step(grid, mpm.NeoHookean(E=1e5, nu=0.3), heat=heat, integrator="implicit")
     with pytest.raises(ValueError, match="equilibrium needs a step without heat"):
@@ -422,7 +412,7 @@ def test_an_equilibrium_does_not_conduct(device):
 
 def test_heat_in_an_implicit_step(device):
     """Conduction in a body at rest is that of an explicit step, and no heat is lost."""
-    grid, state = bar(2, device)
+    grid, state = short_bar(2, device)
     state = state.replace(temperature=100 * torch.sin(5 * state.x[:, 0]))
     ends = []
     for integrator in ("explicit", "implicit"):
@@ -438,7 +428,7 @@ def test_heat_in_an_implicit_step(device):
 def test_sand_feels_trial_tension_with_the_full_energy_alone(device):
     """Numerical cohesion: a block that is pulled apart, whose stress the return map would remove after the solve, is
     slowed down by a full energy and not by the unilateral one."""
-    grid, state = bar(2, device)
+    grid, state = short_bar(2, device)
     pull = 2.0
     C = torch.zeros(len(state), 2, 2, dtype=torch.float64, device=device)
     C[:, 0, 0] = pull
@@ -457,7 +447,7 @@ def test_sand_feels_trial_tension_with_the_full_energy_alone(device):
 
 def test_inverted_particles_have_no_stress(device):
     """As in an explicit step, which `check` reports; the others converge."""
-    grid, state = bar(2, device)
+    grid, state = short_bar(2, device)
     F = torch.eye(2, dtype=torch.float64, device=device).repeat(len(state), 1, 1)
     F[3, 0, 0], F[4, 0, 0], F[5] = -1.0, 0.0, torch.nan
     state = spinning(state.replace(F=F))
@@ -471,7 +461,7 @@ def test_inverted_particles_have_no_stress(device):
 
 def test_a_minimum_that_is_far_away(device):
     """Thrown at a wall so fast that v* turns the body inside out: the line search finds a state of positive volume."""
-    grid, state = bar(2, device, lower=0.0)
+    grid, state = short_bar(2, device, lower=0.0)
     state = state.replace(v=state.v + torch.tensor([0.0, -100.0], dtype=torch.float64, device=device))
     step = mpm.Step(grid, mpm.NeoHookean(E=1e5, nu=0.3), walls="sticky", integrator="implicit")
     after = step(state, 0.02)
@@ -485,7 +475,7 @@ def test_a_minimum_that_is_far_away(device):
 
 @pytest.mark.parametrize("count", [0, 1])
 def test_no_particle_and_one(count, dim, device):
-    grid, state = bar(dim, device)
+    grid, state = short_bar(dim, device)
     state = state.replace(**{n: getattr(state, n)[:count] for n in ("x", "v", "mass", "volume")})
     step = mpm.Step(grid, mpm.NeoHookean(E=1e5, nu=0.3), gravity=(0, -9.8, 0)[:dim], integrator="implicit")
     after = step(state, 0.1)
@@ -495,7 +485,7 @@ def test_no_particle_and_one(count, dim, device):
 
 
 def test_what_is_not_there_says_so():
-    grid, state = bar(2)
+    grid, state = short_bar(2)
     law = mpm.NeoHookean(E=1e5, nu=0.3)
     cases = [
         ({"law": mpm.CustomLaw(lambda F: F)}, "CustomLaw has no energy of a trial state"),
@@ -509,7 +499,7 @@ def test_what_is_not_there_says_so():
 
 
 def test_wrong_arguments_are_named():
-    grid, state = bar(2)
+    grid, state = short_bar(2)
     law = mpm.NeoHookean(E=1e5, nu=0.3)
     with pytest.raises(ValueError, match="integrator must be one of"):
         mpm.Step(grid, law, integrator="midpoint")

@@ -2,10 +2,10 @@
 
 import pytest
 import torch
-from cases.steps import block_state, make_step
 from torch import nn
 
 import torch_mpm as mpm
+from benchmarks.catalogue.scenes import block_state, make_step
 
 
 class StretchNetwork(nn.Module):

@@ -12,6 +12,7 @@ from oracle import principal as reference
 from torch import Tensor
 
 import torch_mpm as mpm
+from benchmarks.catalogue import scenes
 from benchmarks.catalogue.laws import named
 from torch_mpm import ops
 from torch_mpm.ops import law_energy, law_stiffness, law_update, law_wave_modulus
@@ -721,9 +722,8 @@ def laws() -> dict[str, mpm.Material]:
 
 
 def block(dim: int) -> tuple[mpm.Grid, mpm.State]:
-    grid = mpm.Grid(dx=0.1, lower=(0.0,) * dim, upper=(1.0,) * dim)
-    points = mpm.seed.box((0.3, 0.0, 0.3)[:dim], (0.6, 0.4, 0.6)[:dim], 0.1, per_cell=2**dim)
-    return grid, mpm.State.at_rest(points, density=400.0, velocity=(0.0, -3.0, 0.0)[:dim])
+    ends, velocity = ((0.3, 0.0, 0.3)[:dim], (0.6, 0.4, 0.6)[:dim]), (0.0, -3.0, 0.0)[:dim]
+    return scenes.unit_box(dim, 0.1), scenes.block(*ends, 0.1, 400.0, velocity, torch.float32)
 
 
 @pytest.mark.parametrize("name", LAWS)

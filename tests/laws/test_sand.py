@@ -17,6 +17,7 @@ from oracle import sand as reference
 from torch import Tensor
 
 import torch_mpm as mpm
+from benchmarks.catalogue.scenes import block
 from torch_mpm.info import info
 from torch_mpm.ops import quartic_energy, quartic_return_map, quartic_stiffness, quartic_stress
 from torch_mpm.ops.sand import APEX, CONE, ELASTIC, INVALID
@@ -363,8 +364,7 @@ def test_gap_opens_and_closes_without_stress(device, dim, energy, cohesion):
 def test_closing_gap_gives_no_energy(device, dim, energy):
     """A torn, cohesive body in free flight, closing everywhere: nothing pulls it together."""
     grid = mpm.Grid(dx=0.1, lower=(0.0,) * dim, upper=(1.0,) * dim)
-    points = mpm.seed.box((0.3,) * dim, (0.7,) * dim, 0.1, per_cell=2**dim)
-    state = mpm.State.at_rest(points, density=1600.0, dtype=torch.float64).to(device)
+    state = block((0.3,) * dim, (0.7,) * dim, 0.1, density=1600.0, device=device)
     state = state.replace(v=-(state.x - 0.5), extra={"volume_correction": torch.full_like(state.mass, 0.2)})
     law = mpm.QuarticSand(E=1e6, nu=0.3, energy=energy, cohesion=0.02, volume_correction=True)
     step = mpm.Step(grid, law, gravity=(0.0,) * dim)
@@ -413,8 +413,7 @@ class Energies(NamedTuple):
 def collapsing_column(law: mpm.QuarticSand, dt: float, device: str) -> Energies:
     """A column twice as high as wide for 0.08 s."""
     dx, eye = 0.05, torch.eye(2, dtype=torch.float64, device=device)
-    points = mpm.seed.box((0.4, 0.0), (0.6, 0.4), dx, per_cell=4)
-    state = mpm.State.at_rest(points, density=1600.0, dtype=torch.float64, velocity=(0.0, -1.0)).to(device)
+    state = block((0.4, 0.0), (0.6, 0.4), dx, density=1600.0, velocity=(0.0, -1.0), device=device)
     state = state.replace(F=eye.repeat(len(state), 1, 1), C=0 * eye.repeat(len(state), 1, 1))
     grid = mpm.Grid(dx=dx, lower=(0.0, 0.0), upper=(1.0, 1.0))
     step = mpm.Step(grid, law, gravity=(0.0, -9.8), walls="sticky")
@@ -883,8 +882,7 @@ def test_opcheck(device):
 def test_law_in_a_step(device, dim):
     """A column of sand that falls apart stays inside the yield surface and passes gradients to its parameters."""
     grid = mpm.Grid(dx=0.1, lower=(0.0,) * dim, upper=(1.0,) * dim)
-    points = mpm.seed.box((0.3, 0.0, 0.3)[:dim], (0.5, 0.5, 0.5)[:dim], 0.1, per_cell=2**dim)
-    state = mpm.State.at_rest(points, density=1600.0).to(device)
+    state = block((0.3, 0.0, 0.3)[:dim], (0.5, 0.5, 0.5)[:dim], 0.1, density=1600.0, dtype=torch.float32, device=device)
     angle = torch.nn.Parameter(torch.tensor(0.5))
     law = mpm.QuarticSand(E=1e6, nu=0.3, friction_angle=angle).to(device)
     step = mpm.Step(grid, law, gravity=(0.0, -9.8, 0.0)[:dim], walls="sticky")
@@ -933,8 +931,7 @@ def test_law_follows_its_parameters(device):
 def test_law_with_history(device, flow):
     """A column that flies apart: hardening and lost volume are kept in the state, and gradients pass through them."""
     grid = mpm.Grid(dx=0.1, lower=(0.0,) * 3, upper=(1.0,) * 3)
-    points = mpm.seed.box((0.3, 0.0, 0.3), (0.5, 0.4, 0.5), 0.1, per_cell=8)
-    state = mpm.State.at_rest(points, density=1600.0, dtype=torch.float64).to(device)
+    state = block((0.3, 0.0, 0.3), (0.5, 0.4, 0.5), 0.1, density=1600.0, device=device)
     state = state.replace(v=state.x - state.x.mean(0))
     h0 = torch.nn.Parameter(torch.tensor(math.radians(35), dtype=torch.float64))
     law = mpm.QuarticSand(

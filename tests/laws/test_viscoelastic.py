@@ -10,6 +10,7 @@ from helpers import TOLERANCE
 from oracle.viscoelastic import viscoelastic_update
 
 import torch_mpm as mpm
+from benchmarks.catalogue.scenes import block
 from torch_mpm.ops import law_energy, law_update
 
 MU, LAM, BRANCH, TIME = 2.0, 3.0, 5.0, 0.1
@@ -115,8 +116,7 @@ def test_extremes(device):
 def test_rollout_against_differences(device):
     """A falling block in a mixture and a batch: gradients of positions by every parameter."""
     grid = mpm.Grid(0.1, (0, 0), (1, 1), scenes=2)
-    points = mpm.seed.box((0.3, 0.05), (0.6, 0.3), 0.1, per_cell=4)
-    one = mpm.State.at_rest(points, density=1000.0, dtype=torch.float64, device=device)
+    one = block((0.3, 0.05), (0.6, 0.3), 0.1, device=device)
     state = mpm.State.concatenate([one, one], scene=True)
     state = state.replace(v=torch.randn(len(state), 2, dtype=torch.float64, device=device))
     state = state.replace(material=torch.arange(len(state), device=device, dtype=torch.int32) % 2)

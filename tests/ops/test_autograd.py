@@ -13,6 +13,7 @@ from torch.utils.checkpoint import checkpoint
 
 import torch_mpm as mpm
 from benchmarks.catalogue import laws as catalogue
+from benchmarks.catalogue.scenes import block
 from torch_mpm import ops
 from torch_mpm.ops.pointwise import pointwise
 
@@ -188,8 +189,7 @@ def rollout_case(name, device, every=None, n=2):
     """Steps of a law with heat, gravity, a wall and a rotating obstacle; all of their fields are inputs."""
     grid = mpm.Grid(0.1, (0, 0), (1, 1), deterministic=True)
     generator = torch.Generator().manual_seed(1)
-    points = mpm.seed.box((0.3, 0.3), (0.6, 0.6), 0.1, per_cell=4)
-    rest = mpm.State.at_rest(points, density=1000.0, dtype=torch.float64, device=device)
+    rest = block((0.3, 0.3), (0.6, 0.6), 0.1, device=device)
 
     def noise(*shape):
         return torch.randn(shape, generator=generator, dtype=torch.float64).to(device)
@@ -390,8 +390,7 @@ def test_parameters_of_a_step_by_torch_func(device):
     """`functional_call` with the parameters of a step under torch.func.grad."""
     E = torch.nn.Parameter(number(1e4, device))
     step = mpm.Step(mpm.Grid(0.1, (0, 0), (1, 1)), mpm.NeoHookean(E=E, nu=0.3), walls="slip")
-    points = mpm.seed.box((0.3, 0.3), (0.6, 0.6), 0.1, per_cell=4)
-    state = mpm.State.at_rest(points, dtype=torch.float64, device=device)
+    state = block((0.3, 0.3), (0.6, 0.6), 0.1, device=device)
     state = step.prepare(state.replace(v=0.5 - state.x))
 
     def loss(parameters):

@@ -8,6 +8,7 @@ from helpers import relative_error
 from torch._dynamo.testing import CompileCounter
 
 import torch_mpm as mpm
+from benchmarks.catalogue.scenes import block
 
 STEPS, DT = 100, 1e-3
 
@@ -64,8 +65,7 @@ def make_step(name, device):
         ]
     }
     step = mpm.Step(grid, law, gravity=(0.0, -9.8), walls="separate", boundaries=obstacles.get(name, ()))
-    points = mpm.seed.box((0.3, 0.3), (0.6, 0.6), 0.1, per_cell=4)
-    state = mpm.State.at_rest(points, dtype=torch.float64, device=device, velocity=(0.3, -0.5))
+    state = block((0.3, 0.3), (0.6, 0.6), 0.1, velocity=(0.3, -0.5), device=device)
     dt = torch.tensor([DT], dtype=torch.float64, device=device) if name == "tensor dt" else DT
     state = step(state, dt).detach()
     # Compiled, a tensor dt leaves fields without the gaps between components that the ops leave on the CPU.
@@ -115,9 +115,8 @@ def test_a_rollout_that_was_never_run_compiles_twice(device):
     """With `max_blocks` given: once without the affine field that the first step adds, once with it."""
     grid = mpm.Grid(0.1, (0, 0), (1, 1), max_blocks=9)
     step = mpm.Step(grid, mpm.NeoHookean(E=1e4, nu=0.3), gravity=(0.0, -9.8))
-    points = mpm.seed.box((0.3, 0.3), (0.6, 0.6), 0.1, per_cell=4)
     counter = CompileCounter()
-    state = mpm.State.at_rest(points, dtype=torch.float64, device=device)
+    state = block((0.3, 0.3), (0.6, 0.6), 0.1, device=device)
     with torch.no_grad():
         end = mpm.rollout(torch.compile(step, fullgraph=True, backend=counter), state, STEPS, DT)
     assert counter.frame_count == 2

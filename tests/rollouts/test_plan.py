@@ -4,9 +4,10 @@ import dataclasses
 
 import pytest
 import torch
-from cases.rollouts import DT, LAWS_HERE, blob, box, one_by_one
+from cases.rollouts import DT, LAWS_HERE, one_by_one
 
 import torch_mpm as mpm
+from benchmarks.catalogue.scenes import blob, unit_box
 from torch_mpm.rollouts.plan import SCHEDULES, Facts, plan_call
 
 CUDA = Facts(
@@ -193,7 +194,7 @@ def test_calls_of_a_forced_schedule_have_about_as_many_steps():
 
 
 def elastic(device: str, **options) -> tuple[mpm.Step, mpm.State]:
-    return mpm.Step(box(), LAWS_HERE["neo_hookean"](), **options), blob(device)
+    return mpm.Step(unit_box(), LAWS_HERE["neo_hookean"](), **options), blob(device)
 
 
 def test_a_plan_is_a_value(device):

@@ -2,9 +2,10 @@
 
 import pytest
 import torch
-from cases.rollouts import LAWS_HERE, TRANSFERS, WALLS, assert_equal, blob, box, touched
+from cases.rollouts import LAWS_HERE, TRANSFERS, WALLS, assert_equal
 
 import torch_mpm as mpm
+from benchmarks.catalogue.scenes import blob, touched, unit_box
 from torch_mpm._library import graph_loops
 from torch_mpm.rollouts.plan import SCHEDULES
 
@@ -30,7 +31,7 @@ def made(law: str, transfer: str, walls: str, obstacles: bool, device: str) -> t
     dim = 2 + (list(LAWS).index(law) + list(TRANSFERS).index(transfer) + WALLS.index(walls)) % 2
     sphere = mpm.Sphere((0.4,) * dim, 0.15, friction=0.3, velocity=(1.0, -0.5, 0.2)[:dim])
     options = {"boundaries": [sphere] if obstacles else [], "gravity": (0.0, -9.8, 0.0)[:dim], **TRANSFERS[transfer]}
-    step = mpm.Step(box(dim), LAWS[law](), walls=touched(walls, dim), **options)
+    step = mpm.Step(unit_box(dim), LAWS[law](), walls=touched(walls, dim), **options)
     state = blob(device, dim, dtype=torch.float32)
     if law == "mixture":
         state = state.replace(material=(torch.arange(len(state), device=device) % 2).int())
