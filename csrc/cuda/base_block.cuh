@@ -62,7 +62,7 @@ __device__ int further(const Geometry<T, D>& g, int o) {
 
 // Particles of an item or a batch, counted from its first, that are outside their base block; in shared memory.
 template <int Most>
-struct Strays {
+struct OutOfBlockList {
   int count;
   uint16_t particle[Most];
 };

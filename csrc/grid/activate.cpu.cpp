@@ -397,7 +397,7 @@ int64_t add_margin(const Activation<T, D>& s, int64_t slots) {
       entry = int(next++);
     });
   }
-  if (!all) a.next_drift->lost = Drift::kLost;
+  if (!all) a.next_displacement->lost = Displacement::kLost;
   return next;
 }
 
@@ -463,7 +463,7 @@ void activate(const ActivateArguments<T, D>& a) {
   for_parts(s.w.slices, a.particles, [&](int slice, int64_t begin, int64_t end) {
     fill_index(s, slice, begin, end, transferred + s.totals(slice)[W::kDropped]);
   });
-  const int64_t used = a.next_drift ? add_margin(s, slots) : slots;
+  const int64_t used = a.next_displacement ? add_margin(s, slots) : slots;
   if (a.used_slots) *a.used_slots = int(used);
   const int64_t chunks = list_base_blocks(s, slots);
   int64_t breaks = 0;

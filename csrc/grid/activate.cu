@@ -4,7 +4,7 @@
 
 #include "cuda/barrier.cuh"
 #include "cuda/base_block.cuh"
-#include "cuda/chain.cuh"
+#include "cuda/programmatic_launch.cuh"
 #include "grid/activate.h"
 #include "grid/status.h"
 
@@ -407,7 +407,7 @@ __device__ void write_status(const ActivateArguments<T, D>& a, const Workspace& 
   copy_status(a.previous_status ? a.previous_status + start : nullptr, status);
   const bool skipped = errors.outside.count > 0 || errors.not_finite.count > 0;
   if (status[kProblemActivation] < 0 && (skipped || (row == 0 && wanted > a.max_blocks))) {
-    const int missed = a.missed && (a.missed->lost & Drift::kMissed);
+    const int missed = a.missed && (a.missed->lost & Displacement::kMissed);
     status[kProblemActivation] = a.previous_status ? a.previous_status[kActivations] - missed : 0;
     const auto write = [&](const Skipped& out, int count, int first, int id) {
       if (out.count == 0) return;
@@ -451,7 +451,7 @@ __device__ void place(const ActivateArguments<T, D>& a, const Workspace& w, int6
   if (i == 0) {
     *schedule.item_count = c.items;
     *schedule.scattered = is_scattered(c.groups, c.warps);
-    if (a.next_drift && c.margin > a.margin_blocks) a.next_drift->lost = Drift::kLost;
+    if (a.next_displacement && c.margin > a.margin_blocks) a.next_displacement->lost = Displacement::kLost;
   }
   if (i <= a.scenes) write_status(a, w, int(i));
   const bool with_particles = i < min(c.wanted, a.max_blocks);
@@ -524,9 +524,9 @@ __global__ void __launch_bounds__(kThreads) place_kernel(const ActivateArguments
 template <int Order, class T, int D>
 __global__ void __launch_bounds__(kThreads)
     activate_at_once(const ActivateArguments<T, D> a, const Workspace w, int table, int64_t rows) {
-  wait_for_kernel_before();
+  grid_dependency_sync();
   const int64_t start = int64_t(blockIdx.x) * kThreads + threadIdx.x, stride = int64_t(gridDim.x) * kThreads;
-  if (a.drift && !a.fresh && a.drift->lasts(a.particles)) {
+  if (a.displacement && !a.fresh && a.displacement->lasts(a.particles)) {
     for (int64_t row = start; row <= a.scenes; row += stride) {
       int* const status = a.status + row * kStatusSize;
       copy_status(a.previous_status + row * kStatusSize, status);
@@ -575,7 +575,7 @@ void activate(const ActivateArguments<T, D>& a, Stream stream) {
   const int table = a.scenes * a.geometry.blocks_per_scene;
   // Loops over slots with their end, or rows of the status; and over particles.
   const int64_t rows = std::max(a.particles, int64_t(std::max(a.slots(), a.scenes)) + 1);
-  if ((a.drift && !a.fresh) || (!w.marked && !a.deterministic)) {
+  if ((a.displacement && !a.fresh) || (!w.marked && !a.deterministic)) {
     launch_at_once(activate_at_once<Order, T, D>, blocks_for(std::max<int64_t>(rows, w.marked ? 0 : table)), kThreads,
                    0, stream, a, w, table, rows);
     return;

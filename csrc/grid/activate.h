@@ -35,10 +35,11 @@ struct ActivateArguments {
   void* workspace = nullptr;  // its size is that of activate_workspace()
   bool fresh = true;          // whether the table and the workspace are new, not those of an earlier call
   int64_t workspace_size = 0;
-  const Drift* drift = nullptr;   // since the activation in these tensors; null to force a new one
-  int most_of_item = 0;           // on CUDA: particles of an item; 0 for the default
-  const Drift* missed = nullptr;  // states whether the previous step may have missed a particle
-  Drift* next_drift = nullptr;    // kLost if there is no room for all blocks around those with particles; or null
+  const Displacement* displacement = nullptr;  // since the activation in these tensors; null to force a new one
+  int most_of_item = 0;                        // on CUDA: particles of an item; 0 for the default
+  const Displacement* missed = nullptr;        // states whether the previous step may have missed a particle
+  Displacement* next_displacement =
+      nullptr;  // kLost if there is no room for all blocks around those with particles; or null
 
   MPM_HD int slots() const { return max_blocks + margin_blocks; }
 };

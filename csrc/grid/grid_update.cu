@@ -1,4 +1,4 @@
-#include "cuda/chain.cuh"
+#include "cuda/programmatic_launch.cuh"
 #include "grid/grid_update.h"
 
 namespace mpm::cuda {
@@ -10,7 +10,7 @@ constexpr int kLanes = kBlockNodes<D> < 32 ? kBlockNodes<D> : 32;  // lanes of a
 
 template <class T, int D>
 __global__ void __launch_bounds__(kThreads) grid_update_kernel(const GridUpdateArguments<T, D> a) {
-  wait_for_kernel_before();
+  grid_dependency_sync();
   const int64_t node = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   const int slot = int(node / kBlockNodes<D>);
   if (slot >= a.max_blocks) return;
@@ -20,7 +20,7 @@ __global__ void __launch_bounds__(kThreads) grid_update_kernel(const GridUpdateA
 // A whole warp, or half of one in 2-D, works on a slot and sums over its nodes in a fixed order.
 template <class T, int D>
 __global__ void __launch_bounds__(kThreads) grid_update_backward_kernel(const GridUpdateBackwardArguments<T, D> a) {
-  wait_for_kernel_before();
+  grid_dependency_sync();
   const int64_t thread = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   const int64_t slot = thread / kLanes<D>;
   const int lane = int(thread % kLanes<D>);

@@ -22,13 +22,13 @@ struct Topology {
 };
 
 // Cost of a particle out of its block, as a multiple of that of activating one particle, on CUDA.
-constexpr int kStraysOfActivation = 2;
+constexpr int kOutOfBlockCost = 2;
 
 // Counters of the displacement of particles since their activation, which on CUDA may serve several steps.
-struct Drift {
-  int strays;   // particles out of the block that they had then
-  int lost;     // whether one touches, or may soon touch, a block that is not active: bits of Loss
-  int earlier;  // the same, accumulated over the previous steps
+struct Displacement {
+  int out_of_block;  // particles out of the block that they had then
+  int lost;          // whether one touches, or may soon touch, a block that is not active: bits of Loss
+  int earlier;       // the same, accumulated over the previous steps
 
   // kMissed: P2G of the same kernel has already missed a particle.
   enum Loss : int { kLost = 1, kMissed = 2 };
@@ -36,10 +36,10 @@ struct Drift {
   // Particles out of their block cost more than others. A new activation follows once their accumulated cost is that of
   // an activation, that is, once `strays_of_activation` times their count exceeds the number of particles. The total
   // cost is then at most twice the minimum.
-  MPM_HD bool lasts(int64_t particles, int strays_of_activation = kStraysOfActivation) const {
-    return lost == 0 && (int64_t(earlier) + strays) * strays_of_activation <= particles;
+  MPM_HD bool lasts(int64_t particles, int out_of_block_cost = kOutOfBlockCost) const {
+    return lost == 0 && (int64_t(earlier) + out_of_block) * out_of_block_cost <= particles;
   }
-  MPM_HD Drift next(int64_t particles) const { return {0, 0, lasts(particles) ? earlier + strays : 0}; }
+  MPM_HD Displacement next(int64_t particles) const { return {0, 0, lasts(particles) ? earlier + out_of_block : 0}; }
 };
 
 // Entries of the schedule tensor: room for the work items of both backends, with the number of particles of each cell,

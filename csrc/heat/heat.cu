@@ -240,7 +240,7 @@ __device__ void HeatKernel<Order, T, D>::start(WarpMemory<S>& memory) const {
   for (int64_t quad = thread; quad < int64_t(t.max_blocks) * kSlotQuads<D>; quad += threads) {
     T* const vectors[] = {w.v.product, w.v.inverse, w.v.weight};
 #pragma unroll
-    for (T* vector : vectors) store_quad(vector + quad * kBlockWidth, Quad<T>{});
+    for (T* vector : vectors) store_vec4(vector + quad * kBlockWidth, Vec4<T>{});
   }
   for (int64_t scene = thread; scene < t.scenes; scene += threads) {
     lay_out_scene(int(scene));
@@ -268,24 +268,24 @@ __device__ void HeatKernel<Order, T, D>::start(WarpMemory<S>& memory) const {
     const double dt = step_of_scene(a, scene);
     auto sums = StartSums<double>::zero();
     for_quads(slot, end, [&](int64_t i) {
-      Quad<T> mass, weight = load_quad(w.v.weight + i), inverse = load_quad(w.v.inverse + i), r, p;
-      Quad<T> product = load_quad(w.v.product + i);
+      Vec4<T> mass, weight = load_vec4(w.v.weight + i), inverse = load_vec4(w.v.inverse + i), r, p;
+      Vec4<T> product = load_vec4(w.v.product + i);
       const HeatVectors<T> v{mass.e, weight.e, inverse.e, r.e, p.e, product.e};
 #pragma unroll
       for (int k = 0; k < kBlockWidth; k++) sums.add(start_node(a, v, i + k, k, dt, true));
-      store_quad(w.v.mass + i, mass);
-      store_quad(w.v.weight + i, weight);
-      store_quad(w.v.inverse + i, inverse);
-      store_quad(w.v.r + i, r);
-      store_quad(w.v.p + i, p);
-      store_quad(w.v.product + i, product);
-      store_quad(a.increment + i, Quad<T>{});
+      store_vec4(w.v.mass + i, mass);
+      store_vec4(w.v.weight + i, weight);
+      store_vec4(w.v.inverse + i, inverse);
+      store_vec4(w.v.r + i, r);
+      store_vec4(w.v.p + i, p);
+      store_vec4(w.v.product + i, product);
+      store_vec4(a.increment + i, Vec4<T>{});
     });
     put_part(w.start, scene, sums);
   });
   for (int64_t quad = int64_t(*w.used) * kSlotQuads<D> + thread; quad < int64_t(t.max_blocks) * kSlotQuads<D>;
        quad += threads)
-    store_quad(a.increment + quad * kBlockWidth, Quad<T>{});
+    store_vec4(a.increment + quad * kBlockWidth, Vec4<T>{});
   wait_for_all();
 }
 
@@ -320,13 +320,13 @@ __device__ void HeatKernel<Order, T, D>::direct(bool first) const {
     const T beta = T(s.beta), gamma = T(s.gamma);
     Curvature sum{0};
     for_quads(slot, end, [&](int64_t i) {
-      Quad<T> weight = load_quad(w.v.weight + i), inverse = load_quad(w.v.inverse + i), r = load_quad(w.v.r + i);
-      Quad<T> p = load_quad(w.v.p + i);
+      Vec4<T> weight = load_vec4(w.v.weight + i), inverse = load_vec4(w.v.inverse + i), r = load_vec4(w.v.r + i);
+      Vec4<T> p = load_vec4(w.v.p + i);
       const HeatVectors<T> v{nullptr, weight.e, inverse.e, r.e, p.e, nullptr};
       T weighted = T(0);
 #pragma unroll
       for (int k = 0; k < kBlockWidth; k++) weighted += direct_node(v, k, beta, gamma);
-      store_quad(w.v.p + i, p);
+      store_vec4(w.v.p + i, p);
       sum.value += double(weighted);
     });
     put_part(w.slot_curvature, scene, sum);
@@ -357,16 +357,16 @@ __device__ void HeatKernel<Order, T, D>::update() const {
     const T alpha = T(s.alpha);
     auto sums = StepSums<double>::zero();
     for_quads(slot, end, [&](int64_t i) {
-      Quad<T> mass = load_quad(w.v.mass + i), weight = load_quad(w.v.weight + i), inverse = load_quad(w.v.inverse + i);
-      Quad<T> r = load_quad(w.v.r + i), p = load_quad(w.v.p + i), product = load_quad(w.v.product + i);
-      Quad<T> increment = load_quad(a.increment + i);
+      Vec4<T> mass = load_vec4(w.v.mass + i), weight = load_vec4(w.v.weight + i), inverse = load_vec4(w.v.inverse + i);
+      Vec4<T> r = load_vec4(w.v.r + i), p = load_vec4(w.v.p + i), product = load_vec4(w.v.product + i);
+      Vec4<T> increment = load_vec4(a.increment + i);
       const HeatVectors<T> v{mass.e, weight.e, inverse.e, r.e, p.e, product.e};
       auto of_quad = StepSums<T>::zero();
 #pragma unroll
       for (int k = 0; k < kBlockWidth; k++) of_quad.add(update_node(v, increment.e, k, alpha));
-      store_quad(w.v.product + i, product);
-      store_quad(w.v.r + i, r);
-      store_quad(a.increment + i, increment);
+      store_vec4(w.v.product + i, product);
+      store_vec4(w.v.r + i, r);
+      store_vec4(a.increment + i, increment);
       sums.add(of_quad);
     });
     if (wants_sums(s, a.method)) put_part(w.step, scene, sums);
@@ -379,12 +379,12 @@ __device__ void HeatKernel<Order, T, D>::finish() const {
   for_slots([&](int scene, int slot, int end, bool) {
     const T shift = T(energy_shift(w.scene[1][scene]));
     for_quads(slot, end, [&](int64_t i) {
-      const Quad<T> mass = load_quad(w.v.mass + i);
-      Quad<T> increment = load_quad(a.increment + i);
+      const Vec4<T> mass = load_vec4(w.v.mass + i);
+      Vec4<T> increment = load_vec4(a.increment + i);
 #pragma unroll
       for (int k = 0; k < kBlockWidth; k++)
         if (mass.e[k] != T(0)) increment.e[k] += shift;
-      store_quad(a.increment + i, increment);
+      store_vec4(a.increment + i, increment);
     });
   });
   for (int scene = blockIdx.x * blockDim.x + threadIdx.x; scene < a.topology.scenes; scene += gridDim.x * blockDim.x) {

@@ -2,7 +2,7 @@
 
 #include "cuda/base_block.cuh"
 #include "cuda/columns.cuh"
-#include "cuda/quad.cuh"
+#include "cuda/vec4.cuh"
 #include "heat/cell.h"
 #include "heat/sums.cuh"
 
@@ -220,7 +220,7 @@ __device__ void for_support(int cell, const F& f) {
 
 // nodes += q by one atomic operation where there is one for four.
 template <class T>
-__device__ void add_quad(T* nodes, const Quad<T>& q) {
+__device__ void add_quad(T* nodes, const Vec4<T>& q) {
 #if __CUDA_ARCH__ >= 900
   if constexpr (sizeof(T) == 4)
     atomicAdd(reinterpret_cast<float4*>(nodes), make_float4(q.e[0], q.e[1], q.e[2], q.e[3]));
@@ -240,16 +240,16 @@ __device__ T sum_items(const Topology<T, D>& t, const PackedItems<T, D>& packed,
   const Item* const items = reinterpret_cast<const Item*>(schedule_of(t).items);
   LaneCounts<S> counts(packed.counts + int64_t(number) * S::cells);
   const TileQuads<S> quads(t, items[number].slot);
-  Quad<T> loaded[TileQuads<S>::rounds];
+  Vec4<T> loaded[TileQuads<S>::rounds];
 #pragma unroll
   for (int r = 0; r < quads.rounds; r++)
-    loaded[r] = Sum == HeatSum::product && quads.node[r] >= 0 ? load_quad(u + quads.node[r]) : Quad<T>{};
+    loaded[r] = Sum == HeatSum::product && quads.node[r] >= 0 ? load_vec4(u + quads.node[r]) : Vec4<T>{};
   __syncwarp();
 #pragma unroll
   for (int r = 0; r < quads.rounds; r++) {
     if (r * 32 + lane_index() >= 2 * quads.rows) continue;
-    if (Sum == HeatSum::product) store_quad(m.u + quads.at[r], loaded[r]);
-    store_quad(m.sum + quads.at[r], Quad<T>{});
+    if (Sum == HeatSum::product) store_vec4(m.u + quads.at[r], loaded[r]);
+    store_vec4(m.sum + quads.at[r], Vec4<T>{});
   }
   __syncwarp();
   T from[S::nodes], to[S::nodes], power = T(0);
@@ -284,7 +284,7 @@ __device__ T sum_items(const Topology<T, D>& t, const PackedItems<T, D>& packed,
 #pragma unroll
   for (int r = 0; r < quads.rounds; r++) {
     if (quads.node[r] < 0) continue;
-    const Quad<T> sum = load_quad(m.sum + quads.at[r]);
+    const Vec4<T> sum = load_vec4(m.sum + quads.at[r]);
     T* const nodes = out + quads.node[r];
     if (!in_order) {
       add_quad(nodes, sum);

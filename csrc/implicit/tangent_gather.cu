@@ -56,7 +56,7 @@ struct TangentGather {
 #pragma unroll
       for (int i = 0; i < D; i++) stress.at(p, k * D + i) = r[k][i];
   }
-  __device__ void leave_out(int p) const { write(p, {}, zero_matrix<T, D>()); }
+  __device__ void skip(int p) const { write(p, {}, zero_matrix<T, D>()); }
 };
 
 template <int Order, class T, int D>

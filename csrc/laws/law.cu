@@ -19,17 +19,17 @@ __global__ void __launch_bounds__(Law::gpu_threads, kUpdateBlocks<Law, T>)
   if (a.runs_beside)
     let_next_kernel_begin();
   else
-    wait_for_kernel_before();
+    grid_dependency_sync();
   using At = std::conditional_t<Adds, Adding<One<T>>, One<T>>;
   const int64_t p = int64_t(blockIdx.x) * Law::gpu_threads + threadIdx.x;
   if (p < a.law.particles && a.law.members.has(p)) Law::template Kernels<Law>::update(a, At(One<T>{p}));
-  wait_for_kernel_before();  // since the next kernel waits only for this one
+  grid_dependency_sync();  // since the next kernel waits only for this one
 }
 
 template <class Law, bool Adds, class T, int D>
 __global__ void __launch_bounds__(Law::gpu_threads, Law::gpu_backward_blocks)
     law_backward_kernel(const LawBackwardArguments<T, D> a) {
-  wait_for_kernel_before();
+  grid_dependency_sync();
   using At = std::conditional_t<Adds, Adding<One<T>>, One<T>>;
   const int64_t p = int64_t(blockIdx.x) * Law::gpu_threads + threadIdx.x;
   if (p < a.law.particles && a.law.members.has(p)) Law::template Kernels<Law>::update_backward(a, At(One<T>{p}));
@@ -182,12 +182,12 @@ struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true> {
   }
   // Outside the grid, where F has to be updated once more after the particle has left; then its affine field is zero.
   // For a position that is not finite it may be NaN, and F is unchanged.
-  __device__ void leave_out(int p) const {
+  __device__ void skip(int p) const {
     const auto m = read(p, scene_of_late(p), p);
     const bool finite = is_finite<D>(read_vector(Base::position, p).e);
     update(p, finite ? m.affine : zero_matrix<T, D>(), m.dt);
   }
-  __device__ void leave_out_at_rest(int p) const {
+  __device__ void skip_at_rest(int p) const {
     update(p, zero_matrix<T, D>(), Base::fields.time_step(scene_of_late(p)));
   }
 
@@ -202,22 +202,22 @@ struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true> {
 template <class Law, class T, int D>
 struct SettlingSource : LawMomentumSource<Law, T, D, true> {
   using Base = LawMomentumSource<Law, T, D, true>;
-  Settling<T, D> settling;
+  ReorderOnScatter<T, D> reorder;
 
   SettlingSource(const P2GArguments<T, D>& a, const LawUpdateArguments<T, D>& law, const LateDeformation<T, D>& late,
-                 const Settling<T, D>& settling)
-      : Base(a, law, late), settling(settling) {}
+                 const ReorderOnScatter<T, D>& reorder)
+      : Base(a, law, late), reorder(reorder) {}
 
-  bool is_mostly_idle() const { return settling.rows > 0 && settling.is_mostly_idle(); }
-  __device__ bool is_due() const { return settling.rows == 0 || settling.is_due(Base::topology.particles); }
-  __device__ bool settles() const { return settling.rows > 0; }
+  bool is_mostly_idle() const { return reorder.rows > 0 && reorder.is_mostly_idle(); }
+  __device__ bool is_due() const { return reorder.rows == 0 || reorder.is_due(Base::topology.particles); }
+  __device__ bool settles() const { return reorder.rows > 0; }
   __device__ ParticleMomentum<T, D> load(int p, int scene, int place) const {
-    ParticleMomentum<T, D> m = Base::read(p, scene, settling.rows ? settling.place(p) : p);
+    ParticleMomentum<T, D> m = Base::read(p, scene, reorder.rows ? reorder.place(p) : p);
     take(p, place, m, m.affine, m.stress);
     return m;
   }
-  __device__ void leave_out(int p, int place) const {
-    ParticleMomentum<T, D> m = Base::read(p, Base::scene_of_late(p), settling.rows ? settling.place(p) : p);
+  __device__ void skip(int p, int place) const {
+    ParticleMomentum<T, D> m = Base::read(p, Base::scene_of_late(p), reorder.rows ? reorder.place(p) : p);
     const bool finite = is_finite<D>(read_vector(Base::position, p).e);
     take(p, place, m, finite ? m.affine : zero_matrix<T, D>(), m.stress);
   }
@@ -227,20 +227,20 @@ struct SettlingSource : LawMomentumSource<Law, T, D, true> {
                        Matrix<T, D>& stress) const {
     typename Base::Changes changes;
     stress = Base::evaluate(p, C, m.dt, changes);
-    const int to = settling.rows ? settling.in_other_copy(p, place) : p;
+    const int to = reorder.rows ? reorder.in_other_copy(p, place) : p;
     Base::keep(to, changes);
-    if (settling.rows) settle(p, place, to, m);
+    if (reorder.rows) write_reordered(p, place, to, m);
   }
-  __device__ void settle(int p, int place, int to, const ParticleMomentum<T, D>& m) const {
+  __device__ void write_reordered(int p, int place, int to, const ParticleMomentum<T, D>& m) const {
     const One<T> at{to};
-    store_vector<D>(at, settling.x, read_vector(Base::position, p));
-    store_scalar(at, settling.mass, m.mass);
-    store_scalar(at, settling.volume, m.volume);
-    if (settling.residual.pointer)
-      store_vector<D>(at, settling.residual, load_vector<D>(One<T>{p}, settling.residual_before));
-    settling.origin[to] = settling.given ? p : settling.origin[p];
-    settling.index[place] = to;
-    if (place == 0) *settling.copy = to >= settling.rows;
+    store_vector<D>(at, reorder.x, read_vector(Base::position, p));
+    store_scalar(at, reorder.mass, m.mass);
+    store_scalar(at, reorder.volume, m.volume);
+    if (reorder.residual.pointer)
+      store_vector<D>(at, reorder.residual, load_vector<D>(One<T>{p}, reorder.residual_before));
+    reorder.origin[to] = reorder.given ? p : reorder.origin[p];
+    reorder.index[place] = to;
+    if (place == 0) *reorder.copy = to >= reorder.rows;
   }
 };
 
@@ -252,8 +252,8 @@ template <class Law, int D>
   requires(!Law::additive)
 struct FusedLaunch<Law, float, D> {
   static void p2g(const LawUpdateArguments<float, D>& law, const LateDeformation<float, D>& late,
-                  const P2GArguments<float, D>& a, const Settling<float, D>& settling, void* stream) {
-    launch_scatter(SettlingSource<Law, float, D>(a, law, late, settling), false, static_cast<Stream>(stream));
+                  const P2GArguments<float, D>& a, const ReorderOnScatter<float, D>& reorder, void* stream) {
+    launch_scatter(SettlingSource<Law, float, D>(a, law, late, reorder), false, static_cast<Stream>(stream));
   }
   static void g2p2g(const LawUpdateArguments<float, D>& law, const G2P2GArguments<float, D>& a, void* stream) {
     launch_g2p2g(LawMomentumSource<Law, float, D, true>(a.p2g, law, a.late),
@@ -266,10 +266,10 @@ struct FusedLaunch<Law, float, D> {
                       AdvanceGather<2, float, D, false, true, false>(a.advance), a, static_cast<Stream>(stream));
   }
 #endif
-  static void block_per_scene(const LawUpdateArguments<float, D>& law, const ResidentArguments<float, D>& a,
+  static void block_per_scene(const LawUpdateArguments<float, D>& law, const BlockPerSceneArguments<float, D>& a,
                               void* stream) {
-    launch_resident(LawMomentumSource<Law, float, D, false>(a.p2g, law),
-                    AdvanceGather<2, float, D, false, false>(a.advance), a, static_cast<Stream>(stream));
+    launch_block_per_scene(LawMomentumSource<Law, float, D, false>(a.p2g, law),
+                           AdvanceGather<2, float, D, false, false>(a.advance), a, static_cast<Stream>(stream));
   }
 };
 

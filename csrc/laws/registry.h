@@ -34,13 +34,13 @@ struct LawKernels {
   void (*energy_double_backward)(const LawEnergyDoubleBackwardArguments<T, D>&, void* stream) = nullptr;
   // Update of F or J, law and P2G in one, the stress in registers: for quadratic weights and the MLS form, on CUDA.
   void (*p2g)(const LawUpdateArguments<T, D>&, const LateDeformation<T, D>&, const P2GArguments<T, D>&,
-              const Settling<T, D>&, void* stream) = nullptr;
+              const ReorderOnScatter<T, D>&, void* stream) = nullptr;
   // G2P and the next P2G in one.
   void (*g2p2g)(const LawUpdateArguments<T, D>&, const G2P2GArguments<T, D>&, void* stream) = nullptr;
   // Substeps of few particles, for quadratic weights and the MLS form, on CUDA 13.
   void (*persistent)(const LawUpdateArguments<T, D>&, const PersistentArguments<T, D>&, void* stream) = nullptr;
   // All substeps of small scenes, for quadratic weights and the MLS form, on CUDA.
-  void (*block_per_scene)(const LawUpdateArguments<T, D>&, const ResidentArguments<T, D>&, void* stream) = nullptr;
+  void (*block_per_scene)(const LawUpdateArguments<T, D>&, const BlockPerSceneArguments<T, D>&, void* stream) = nullptr;
   void (*tangent)(const LawTangentArguments<T, D>&, void* stream) = nullptr;
 };
 

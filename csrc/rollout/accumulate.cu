@@ -1,6 +1,6 @@
 #include "rollout/accumulate.h"
 
-#include "cuda/chain.cuh"
+#include "cuda/programmatic_launch.cuh"
 #include "cuda/slot_sums.cuh"
 
 namespace mpm::cuda {
@@ -26,7 +26,7 @@ __global__ void __launch_bounds__(kThreads) advance_clocks_kernel(const AdvanceC
 
 template <class T, int D>
 __global__ void __launch_bounds__(kThreads) add_scaled_kernel(const AddScaledArguments<T, D> a) {
-  wait_for_kernel_before();
+  grid_dependency_sync();
   const int64_t p = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (p >= a.count) return;
 #pragma unroll

@@ -43,7 +43,7 @@ struct ChunkLaw {
 struct Whereabouts {
   float displacement_budget;  // displacement budget: cells that every particle can move on each axis within the
                               // activation
-  int strays;                 // particles out of the block of their activation
+  int out_of_block;           // particles out of the block of their activation
 };
 
 template <class T, int D>

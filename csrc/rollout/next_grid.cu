@@ -1,7 +1,7 @@
 #include "rollout/next_grid.h"
 
-#include "cuda/chain.cuh"
 #include "cuda/fixed_point.cuh"
+#include "cuda/programmatic_launch.cuh"
 
 namespace mpm::cuda {
 namespace {
@@ -18,7 +18,7 @@ __device__ bool goes_far(const GridUpdateArguments<T, D>& a, const SlotUpdate<T,
   return !near;
 }
 
-// A node of a slot, and what is known of it before P2G is done.
+// A node of a slot, with its data that do not depend on P2G.
 template <class T, int D>
 struct Node {
   int slot, local;
@@ -50,14 +50,13 @@ __device__ void take_node(const NextGridArguments<T, D>& a, const Node<T, D>& no
   if constexpr (Obstacles)
     row.value = after_obstacles(a.contact, node.contact, node.touch,
                                 node_position(a.contact, node.contact.corner, node.local), row.value);
-  if (a.watched && goes_far(a.update, node.there, row)) atomicOr(&a.watched->lost, Drift::kLost);
+  if (a.watched && goes_far(a.update, node.there, row)) atomicOr(&a.watched->lost, Displacement::kLost);
   a.update.updated[node.row()] = row;
   if (a.emptied) NodeRows<T, D>::empty(a.emptied, node.row(), a.fixed);
 }
 
-// In strides of the grid, so that a pool that is mostly unused costs nothing: of the slots, and of those of the margin,
-// those in use come first. Where the first node of a thread is, and which obstacle touches it, is found while P2G is at
-// work.
+// In strides of the grid, so that a mostly unused pool costs nothing: the used slots come first, and likewise those of
+// the margin. The place of the first node of a thread, and the obstacle that touches it, are found during P2G.
 template <bool Obstacles, class T, int D>
 __global__ void __launch_bounds__(kThreads) next_grid_kernel(const __grid_constant__ NextGridArguments<T, D> a) {
   constexpr int slots = kThreads / kBlockNodes<D>;  // at a time
@@ -65,14 +64,14 @@ __global__ void __launch_bounds__(kThreads) next_grid_kernel(const __grid_consta
   Node<T, D> node;
   node.local = int(threadIdx.x) % kBlockNodes<D>;
   int found = -1;
-  if (a.particles > 0 && first < a.update.max_blocks) {  // without particles the kernel before is the activation
+  if (a.particles > 0 && first < a.update.max_blocks) {  // without particles the previous kernel is the activation
     found = first;
     node.find(a, found);
     if (Obstacles && node.is_in_use()) node.find_obstacles(a);
   }
-  wait_for_kernel_before();
+  grid_dependency_sync();
   if (blockIdx.x == 0 && threadIdx.x == 0) {
-    *a.next_drift = a.drift->next(a.particles);
+    *a.next_displacement = a.displacement->next(a.particles);
     if (a.items_taken) *a.items_taken = 0;
   }
   for (int slot = first; slot < a.update.max_blocks; slot += stride) {
@@ -94,7 +93,7 @@ __global__ void __launch_bounds__(kThreads) next_grid_kernel(const __grid_consta
 template <class T, int D>
 void next_grid(const NextGridArguments<T, D>& a, Stream stream) {
   if (a.update.max_blocks == 0) return;
-  // A node for each thread, or for each that fits, and some more of them to go round.
+  // A thread for each node, or as many as fit, with some more to balance the load.
   const unsigned most = 4 * unsigned(2048 / kThreads * device_attribute(cudaDevAttrMultiProcessorCount));
   const unsigned blocks =
       std::min(grid_size((int64_t(a.update.max_blocks) * kBlockNodes<D> + kThreads - 1) / kThreads), most);

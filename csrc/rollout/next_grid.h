@@ -17,10 +17,10 @@ struct NextGridArguments {
   bool obstacles = false;
   ContactArguments<T, D> contact;    // without its nodes
   NodeRow<T, D>* emptied = nullptr;  // nodes to clear; null if mirrors read the nodes of other blocks
-  const Drift* drift = nullptr;
-  Drift* next_drift = nullptr;
-  Drift* watched = nullptr;    // kLost if nodes move so far that particles may leave the active blocks; or null
-  int* items_taken = nullptr;  // counter to clear; or null
+  const Displacement* displacement = nullptr;
+  Displacement* next_displacement = nullptr;
+  Displacement* watched = nullptr;  // kLost if nodes move so far that particles may leave the active blocks; or null
+  int* items_taken = nullptr;       // counter to clear; or null
   int64_t particles = 0;
 };
 

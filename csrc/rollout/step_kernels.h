@@ -14,8 +14,8 @@
 #include "rollout/plan.op.h"
 #include "transfer/kernels.h"
 
-// Many steps in one call: activation, laws, P2G, grid update, obstacles, G2P, one after another as the ops of one step
-// do them, in buffers that belong to the call. What the ops of rollouts share.
+// Many steps in one call: activation, laws, P2G, grid update, obstacles and G2P in the order of the ops of one step, in
+// buffers that belong to the call. Shared by the ops of rollouts.
 namespace mpm {
 
 // As a growing grid does in torch_mpm/grid/grid.py.
@@ -63,7 +63,7 @@ Topology<T, D> topology_of(const ActivateArguments<T, D>& a) {
   return t;
 }
 
-// The kernels of a step with their arguments, of which a call makes most once.
+// The kernels of a step with their arguments; a call makes most of these once.
 template <class T, int D>
 struct Substeps {
   const SubstepsInputs& in;
@@ -79,22 +79,22 @@ struct Substeps {
   Pool<T, D> pool;
   Tensor stress, step_time;
   Tensor scene_time;              // the time of each scene now, where each has its own
-  Tensor drifts;                  // one for each of two substeps in turn, where activations last
+  Tensor displacements;           // counters of two substeps in turn, if activations last
   Tensor largest_mass;            // of a particle, where sums are fixed
-  NextGridArguments<T, D> next;   // of these; its update and contact are those here
-  Tensor impulse, impulse_slots;  // on obstacles and walls so far; where someone asks, see `add_impulses_to`
+  NextGridArguments<T, D> next;   // with `update` and `contact` of this struct
+  Tensor impulse, impulse_slots;  // accumulated on obstacles and walls, if wanted; see `add_impulses_to`
   bool obstacles = false, fused = false;
-  Tensor kept;                   // of FLIP, see `keep_velocities`
-  LateDeformation<T, D> late;    // of P2G, where a G2P leaves F and J to the next one
-  Settling<T, D> settling;       // of P2G, where the call owns its particles
-  bool nodes_are_clear = false;  // when a step begins
-  int used_slots = 0;            // on the CPU: that have a block, where the activation is asked to tell
+  Tensor kept;                     // of FLIP, see `keep_velocities`
+  LateDeformation<T, D> late;      // of P2G, if G2P defers F or J to it
+  ReorderOnScatter<T, D> reorder;  // of P2G, if the call owns the particles
+  bool nodes_are_clear = false;    // when a step begins
+  int used_slots = 0;              // on the CPU: number of slots with a block, if the activation counts them
   const int* previous_status = nullptr;
   PlanFacts facts;
 
   explicit Substeps(const SubstepsInputs& inputs);
 
-  // What the next substep reads, and where the laws put the deformation gradients after their return maps.
+  // Sets the inputs of the next substep, and the destination `mapped` of deformation gradients after return maps.
   void read(const Particles<const T>& p, const Field<T>& mapped) {
     bool maps = false;  // whether F of the material has changed before an added law reads it
     for (size_t k = 0; k < laws.size(); k++) {
@@ -114,8 +114,8 @@ struct Substeps {
     advance.residual = p.residual;
   }
 
-  // In place of what read() and write() say of F and J: P2G moves them into those of `p` if a G2P `has_left` that, and
-  // G2P leaves them to the next P2G unless it is the last.
+  // Replaces the settings of read() and write() for F and J: P2G updates those of `p` if a G2P has deferred that
+  // (`has_left`), and G2P defers the update to the next P2G, except in the last substep.
   void move_late(const Particles<T>& p, bool has_left, bool last) {
     const bool is_F = calls[0].law->info.field == Deformation::gradient;
     const Field<T>& state = is_F ? p.F : p.J;
@@ -125,7 +125,7 @@ struct Substeps {
     (is_F ? advance.F_next : advance.J_next) = state;
   }
 
-  // Where it leaves its results.
+  // Sets the destinations of the results.
   void write(const Particles<T>& p) {
     for (size_t k = 0; k < laws.size(); k++)
       if (!calls[k].history.empty()) laws[k].history = variable<T, D>(p.history, calls[k].first_column, false);
@@ -139,8 +139,8 @@ struct Substeps {
 
   bool flips() const { return in.flip > 0; }
 
-  // What FLIP adds its share of to the velocities of G2P: those of the particles less those of the nodes before the
-  // forces. Takes the nodes of the pool, which P2G has not yet.
+  // Velocities of the particles minus those of the nodes before the forces; FLIP adds its share of them after G2P. Uses
+  // the nodes of the pool, before P2G does.
   void keep_velocities(const P2GArguments<T, D>& particles, const Field<T>& to, backend::Stream stream) {
     clear_nodes(stream);
     const GridUpdateArguments<T, D> before =
@@ -155,8 +155,8 @@ struct Substeps {
     backend::add_scaled(AddScaledArguments<T, D>{in.x.size(0), to, particles.velocity, constant(to), -1}, stream);
   }
 
-  // The nodes, zero on entry, and their velocities before the forces and all boundaries but the mirrors; gives the
-  // update between the two.
+  // Computes the nodes, zero on entry, and their velocities before the forces and all boundaries except mirrors;
+  // returns the arguments of the update.
   GridUpdateArguments<T, D> find_nodes_before(P2GArguments<T, D> particles, T* nodes, NodeRow<T, D>* updated,
                                               backend::Stream stream) const {
     particles.stress = {};
@@ -177,8 +177,8 @@ struct Substeps {
     backend::add_scaled(AddScaledArguments<T, D>{in.x.size(0), v, constant(v), velocities, in.flip}, stream);
   }
 
-  // Finds the active blocks; false where the pool has no room for them and must not grow. On CUDA nobody waits for the
-  // answer: the status tells.
+  // Finds the active blocks; false if the pool has no room for them and must not grow. On CUDA the result is true
+  // without a wait, and the status has the number of blocks.
   bool activate(const int* previous_status, int* status, backend::Stream stream) {
     activation.previous_status = previous_status;
     activation.status = status;
@@ -201,21 +201,21 @@ struct Substeps {
   }
 
   // On the CPU an activation may serve several substeps of a call that owns its particles: blocks around those with
-  // particles are active too, as far as there is room.
+  // particles are active too, if there is room.
   void make_margin() {
     const int64_t most = std::min<int64_t>(update.block_count, INT32_MAX / kBlockNodes<D> - activation.max_blocks);
     activation.margin_blocks = int(std::clamp<int64_t>(2 * activation.max_blocks + 64, 0, std::max<int64_t>(most, 0)));
   }
 
-  // On CUDA an activation may serve several substeps: blocks around those with particles are active too, and G2P tells
-  // when they no longer suffice. Not where sums have an order, which is that of whole blocks, and not of FLIP, whose
-  // second P2G and whose gather look in the blocks of the activation alone.
+  // On CUDA an activation may serve several substeps: blocks around those with particles are active too, and G2P
+  // detects when they no longer suffice. Exceptions: sums with an order, which is that of whole blocks, and FLIP, whose
+  // second P2G and gather use the blocks of the activation only.
   void let_activations_last(backend::Stream stream) {
     if (MPM_BACKEND == MPM_BACKEND_IS_cpu || (in.lattice.deterministic() && !sums_are_fixed(facts)) || flips()) return;
     if (sums_are_fixed(facts)) fix_sums(stream);
-    drifts = empty_int(in.x, {2, sizeof(Drift) / sizeof(int)});
-    torch::stable::zero_(drifts);
-    p2g.drifted = true;
+    displacements = empty_int(in.x, {2, sizeof(Displacement) / sizeof(int)});
+    torch::stable::zero_(displacements);
+    p2g.displaced = true;
     advance.loads_ahead = true;
     for (LawUpdateArguments<T, D>& law : laws) law.runs_beside = !law.adds;
     next.particles = in.x.size(0);
@@ -238,16 +238,15 @@ struct Substeps {
 #endif
   }
 
-  // Where there is a kernel for it, P2G computes the stress itself.
+  // Lets P2G compute the stress, if there is a kernel for it.
   void fuse(bool keeps_stress) {
     fused = why_not_fused_law(facts).empty() && !p2g.deterministic && calls[0].law->kernels<T, D>().p2g;
     if (fused && !keeps_stress) forget_stress();
   }
 
-  // Whether P2G moves F or J, which it needs the affine field and a kernel of the law for, where particles stay where
-  // they are in memory.
+  // Whether P2G updates F or J. It needs the affine field and a kernel of the law; particles stay in place in memory.
   bool moves_late() const {
-    return fused && drifts.defined() && in.apic && facts.one_deformation && in.x.size(0) <= kMostLateParticles;
+    return fused && displacements.defined() && in.apic && facts.one_deformation && in.x.size(0) <= kMostLateParticles;
   }
 
   void forget_stress() {
@@ -255,17 +254,17 @@ struct Substeps {
     for (LawUpdateArguments<T, D>& law : laws) law.stress = {};
   }
 
-  // Of the substeps that read what others of the same parity have written. The last one is activated in any case, so
-  // that the status tells how many blocks there are by then.
-  void take_turn(int parity, bool last) {
-    if (!drifts.defined()) return;
-    Drift* const drift = static_cast<Drift*>(drifts.data_ptr());
-    activation.drift = last ? nullptr : drift + parity;
-    next.drift = drift + parity;
-    next.next_drift = advance.drift = drift + (1 - parity);
+  // Selects the counters of a substep by its parity. The last substep always has an activation, whose status counts the
+  // blocks at the end.
+  void swap_buffers(int parity, bool last) {
+    if (!displacements.defined()) return;
+    Displacement* const displacement = static_cast<Displacement*>(displacements.data_ptr());
+    activation.displacement = last ? nullptr : displacement + parity;
+    next.displacement = displacement + parity;
+    next.next_displacement = advance.displacement = displacement + (1 - parity);
   }
 
-  // The time of obstacles, added up as single steps do: by a device itself, where the host may not be there.
+  // Accumulates the time of obstacles as single steps do; on a device, which may run ahead of the host.
   void count_time([[maybe_unused]] const int* status_before, [[maybe_unused]] backend::Stream stream) {
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda
     if (!obstacles) return;
@@ -286,13 +285,13 @@ struct Substeps {
     if (flips()) add_flip(field<const T>(kept), stream);
   }
 
-  // The time after a step, on the CPU and of scenes with clocks of their own.
+  // Advances the time after a step, on the CPU and for scenes with separate clocks.
   void end_time(backend::Stream stream) {
     if (MPM_BACKEND == MPM_BACKEND_IS_cpu) contact.time += in.dt, contact.row += contact.step_stride;
     if (scene_time.defined()) advance_clocks(static_cast<double*>(scene_time.data_ptr()), stream);
   }
 
-  // Scenes with time steps and clocks of their own begin at `times`, which goes on with them.
+  // Scenes with separate time steps and clocks begin at `times`, which is advanced.
   void count_scene_times(const Tensor& times) {
     scene_time = times;
     contact.scene_time = static_cast<const double*>(times.data_ptr());
@@ -304,11 +303,11 @@ struct Substeps {
     backend::advance_clocks(AdvanceClocksArguments<T, D>{times, scene_dt, in.dt, in.scenes}, stream);
   }
 
-  // From a stress that is there, or that P2G computes, to the velocities of the nodes.
+  // From the stress, which may be computed by P2G, to the velocities of the nodes.
   void move_grid(backend::Stream stream) {
     clear_nodes(stream);
     if (fused)
-      calls[0].law->kernels<T, D>().p2g(laws[0], late, p2g, settling, stream);
+      calls[0].law->kernels<T, D>().p2g(laws[0], late, p2g, reorder, stream);
     else
       backend::p2g(in.lattice.order(), p2g, stream);
     move_nodes(stream);
@@ -333,10 +332,10 @@ struct Substeps {
     backend::contact(contact, stream);
   }
 
-  // On CUDA, where activations last, perhaps with contact.
+  // With contact on CUDA, if activations last.
   void update_grid(backend::Stream stream) {
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda
-    if (drifts.defined()) {
+    if (displacements.defined()) {
       next.update = update;
       next.contact = contact;
       return backend::next_grid(next, stream);
@@ -350,7 +349,7 @@ struct Substeps {
 
   Shape impulse_shape() const { return {in.scenes, int64_t(in.shape.size()) + 2 * D, kImpulse<D>}; }
 
-  // Of some of these boundaries.
+  // Impulses of `count` of these boundaries.
   ImpulseArguments<D> impulses(int64_t first, int64_t count) {
     return impulse_arguments<D>(in.lattice, impulse, first, count, activation.slots(), impulse_slots);
   }
@@ -361,7 +360,7 @@ struct Substeps {
     return {contact, reinterpret_cast<const T*>(update.updated), 1 + D, impulses(0, int64_t(in.shape.size()))};
   }
 
-  // Of the nodes, after contact.
+  // Node velocities after contact.
   const NodeRow<T, D>* velocities() const {
     return static_cast<const NodeRow<T, D>*>((pool.velocity.defined() ? pool.velocity : pool.updated).data_ptr());
   }
@@ -444,7 +443,7 @@ Substeps<T, D>::Substeps(const SubstepsInputs& inputs) : in(inputs) {
   facts = facts_of_call();
 }
 
-// Without the facts of the stream and the device.
+// The facts of a call, except those of the stream and the device.
 template <class T, int D>
 PlanFacts Substeps<T, D>::facts_of_call() const {
   PlanFacts f;
@@ -478,22 +477,22 @@ PlanFacts Substeps<T, D>::facts_of_call() const {
   return f;
 }
 
-// For the arguments' number of blocks.
+// Makes the pool for the number of blocks of the arguments.
 template <class T, int D>
 void Substeps<T, D>::make_pool(backend::Stream stream) {
-  const bool apart = obstacles && !next.obstacles;  // contact from the grid update
+  const bool apart = obstacles && !next.obstacles;  // contact is separate from the grid update
   pool.make(in.x, activation, apart, stream);
   if (largest_mass.defined()) pool.nodes = empty(in.x, Pool<T, D>::nodes_shape(activation), ScalarType::Long);
   if (impulse.defined() && (MPM_BACKEND == MPM_BACKEND_IS_cpu || in.lattice.deterministic()))
     impulse_slots = empty(in.x, {activation.slots(), impulse_shape()[1] * kImpulse<D>}, ScalarType::Double);
   use_pool();
-  if (drifts.defined() && !update.walls.mirrored) {
+  if (displacements.defined() && !update.walls.mirrored) {
     backend::clear(pool.nodes, stream);
     next.emptied = static_cast<NodeRow<T, D>*>(pool.nodes.data_ptr());
   }
 }
 
-// The kernels read and write the activation and the pool that are there.
+// Sets the present activation and pool in the arguments of the kernels.
 template <class T, int D>
 void Substeps<T, D>::use_pool() {
   const Topology<T, D> topology = topology_of(activation);
@@ -511,7 +510,7 @@ void Substeps<T, D>::use_pool() {
   advance.gather.nodes = {velocities()->value.e, 1 + D, D};
 }
 
-// To a kernel of many substeps: those of scenes that have their own.
+// Passes clocks of scenes to a kernel of many substeps.
 template <class T, int D, class Arguments>
 void give_clocks(const Substeps<T, D>& s, Arguments& a) {
   if (!s.scene_time.defined()) return;

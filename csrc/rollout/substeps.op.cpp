@@ -211,7 +211,7 @@ Results run(const SubstepsInputs& in) {
     // One substep from one of the two buffers into the other.
     const auto substep = [&](int into, bool last, backend::Stream on) {
       int* const now = static_cast<int*>(status[into].data_ptr());
-      s.take_turn(into, last);
+      s.swap_buffers(into, last);
       s.read(from, field<T>(F_[1 - into]));
       const Particles<T> to = buffers(into);
       s.write(to);

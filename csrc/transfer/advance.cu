@@ -1,4 +1,4 @@
-#include "cuda/chain.cuh"
+#include "cuda/programmatic_launch.cuh"
 #include "transfer/advance.h"
 
 namespace mpm::cuda {
@@ -8,14 +8,14 @@ constexpr int kThreads = 128;
 
 template <class T, int D>
 __global__ void __launch_bounds__(kThreads) advance_kernel(const AdvanceArguments<T, D> a) {
-  wait_for_kernel_before();
+  grid_dependency_sync();
   const int64_t p = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (p < a.particles) advance_particle(a, One<T>{p});
 }
 
 template <class T, int D>
 __global__ void __launch_bounds__(kThreads) advance_backward_kernel(const AdvanceBackwardArguments<T, D> a) {
-  wait_for_kernel_before();
+  grid_dependency_sync();
   const int64_t p = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (p < a.forward.particles) advance_particle_backward(a, One<T>{p});
 }

@@ -51,8 +51,8 @@ struct G2PAdvanceArguments {
   bool late = false;  // F and J are updated by P2G, where there is a LateDeformation; on CUDA
   // On CUDA: particles may be in active blocks other than those of the activation, and their new places are counted
   // here.
-  Drift* drift = nullptr;
-  GivingBack<T> own;  // on CUDA
+  Displacement* displacement = nullptr;
+  RestoreOrder<T> own;  // on CUDA
   // On CUDA: whether the previous kernel writes only nodes of the inputs of this one, so that it can load all other
   // inputs meanwhile.
   bool loads_ahead = false;

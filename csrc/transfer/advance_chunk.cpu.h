@@ -143,7 +143,7 @@ struct Motion {
 
 // End of the step for particles that are not transferred.
 template <class T, int D>
-void leave_outside(const G2PAdvanceArguments<T, D>& a) {
+void skip_outside(const G2PAdvanceArguments<T, D>& a) {
   for_outside(a.gather.topology, [&](int64_t p) {
     const Vector<T, D> x = load_vector<D>(One<T>{p}, a.gather.x);
     const T rest = is_finite<D>(x.e) ? T(0) : T(a.gather.lost);

@@ -12,11 +12,11 @@ struct Motion {
 };
 
 // G2P with the end of the step, so that v and C need not be read again. Without Move, P2G updates F and J.
-template <int Order_, class T_, int D_, bool Gradient, bool Drifts, bool Moves = true>
+template <int Order_, class T_, int D_, bool Gradient, bool Displaced, bool Moves = true>
 struct AdvanceGather {
   using T = T_;
   static constexpr int Order = Order_, D = D_, K = D;
-  static constexpr bool drifts = Drifts;
+  static constexpr bool displaced = Displaced;
   static constexpr int resident = Gradient ? 4 : Moves ? 5 : 6;
   using Shape = SumShape<Order, T, D, K, 0, true, Gradient, SlopeForm::none>;
   struct Loaded {
@@ -36,7 +36,7 @@ struct AdvanceGather {
   Field<const T> scene_dt;
   T dt, moment_scale, gradient_scale;  // converts from cells
   T lost;
-  Drift* drift;
+  Displacement* displacement;
   bool loads_ahead;
 
   explicit AdvanceGather(const G2PAdvanceArguments<T, D>& a)
@@ -57,7 +57,7 @@ struct AdvanceGather {
         moment_scale(T(a.gather.moment_scale * double(topology.geometry.dx))),
         gradient_scale(topology.geometry.inverse_dx),
         lost(T(a.gather.lost)),
-        drift(a.drift),
+        displacement(a.displacement),
         loads_ahead(a.loads_ahead) {}
 
   __device__ Loaded load(int p, int scene) const {
@@ -136,8 +136,8 @@ struct AdvanceGather {
     for (int i = 0; i < D; i++) residual_next.at(to, i) = rest[i];
     return next;
   }
-  __device__ void leave_out(int p) const { leave_out(p, p, p); }
-  __device__ void leave_out(int p, int of_motion, int to) const {
+  __device__ void skip(int p) const { skip(p, p, p); }
+  __device__ void skip(int p, int of_motion, int to) const {
     const mpm::Vector<T, D> x = read_vector(position, p);
     const T rest = is_finite<D>(x.e) ? T(0) : lost;
 #pragma unroll
@@ -160,7 +160,7 @@ struct AdvanceGather {
 template <class T, int D, bool Ends>
 struct OwnAdvanceGather : AdvanceGather<2, T, D, false, true, Ends> {
   using Base = AdvanceGather<2, T, D, false, true, Ends>;
-  GivingBack<T> own;
+  RestoreOrder<T> own;
 
   explicit OwnAdvanceGather(const G2PAdvanceArguments<T, D>& a) : Base(a), own(a.own) {}
 
@@ -171,10 +171,10 @@ struct OwnAdvanceGather : AdvanceGather<2, T, D, false, true, Ends> {
     give_history(p, to);
     return Base::write(p, to, Ends ? to : p, l, s);
   }
-  __device__ void leave_out(int p) const {
+  __device__ void skip(int p) const {
     const int to = target(p);
     give_history(p, to);
-    Base::leave_out(p, to, Ends ? to : p);
+    Base::skip(p, to, Ends ? to : p);
   }
 
  private:

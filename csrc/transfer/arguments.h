@@ -16,9 +16,9 @@ struct P2GArguments {
   double dt = 0;
   StressForm form = StressForm::mls;
   bool deterministic = false;
-  bool drifted = false;  // particles may be in active blocks other than those of the activation; with stress, on CUDA
-  NodeField<T> nodes;    // zero on entry; 1 + D channels: mass, momentum
-  FixedPoint fixed;      // sums of the nodes, on CUDA
+  bool displaced = false;  // particles may be in active blocks other than those of the activation; with stress, on CUDA
+  NodeField<T> nodes;      // zero on entry; 1 + D channels: mass, momentum
+  FixedPoint fixed;        // sums of the nodes, on CUDA
 };
 
 // ∂Φ/∂x_p of the trilinear form Φ = Σ_p Σ_i g_i · [N_i (value_p + scale moment_p (x_i − x_p)) + gradient_p ∇N_i], which

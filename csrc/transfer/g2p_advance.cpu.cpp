@@ -55,7 +55,7 @@ void g2p_advance(const G2PAdvanceArguments<T, D>& a) {
     g2p_advance_with<Order, true>(a);
   else
     g2p_advance_with<Order, false>(a);
-  leave_outside(a);
+  skip_outside(a);
 }
 
 MPM_INSTANTIATE_ORDERS(g2p_advance, G2PAdvanceArguments)

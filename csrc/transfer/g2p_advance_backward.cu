@@ -15,7 +15,7 @@ template <int Order, class T, int D>
 struct MotionAdjointSource {
   using Shape = ScatterShape<Order, T, D, 0, D, false>;
   static constexpr int resident = 0;
-  static constexpr bool drifts = false;
+  static constexpr bool displaced = false;
   Topology<T, D> topology;
   NodeField<T> nodes;
   Columns<const T, D> position;

@@ -58,7 +58,7 @@ struct FieldGather {
       }
     }
   }
-  __device__ void leave_out(int p) const {
+  __device__ void skip(int p) const {
     const T nothing = is_finite<D>(read_vector(position, p).e) ? T(0) : lost;
 #pragma unroll
     for (int k = 0; k < K; k++) value.write(p, k, nothing);
@@ -150,7 +150,7 @@ struct FieldPositionGradient {
 #pragma unroll
     for (int i = 0; i < D; i++) out.at(p, i) = adds ? out.at(p, i) + r[i] : r[i];
   }
-  __device__ void leave_out(int p) const { write(p, {}, {}); }
+  __device__ void skip(int p) const { write(p, {}, {}); }
 };
 
 template <int Order, class T, int D>
@@ -250,7 +250,7 @@ struct MomentumAdjoint {
       }
     }
   }
-  __device__ void leave_out(int p) const { write(p, {}, {}); }
+  __device__ void skip(int p) const { write(p, {}, {}); }
 };
 
 // The same after the position gradient of the motion, in one pass.

@@ -1,7 +1,7 @@
 #pragma once
 
-#include "cuda/chain.cuh"
-#include "cuda/quad.cuh"
+#include "cuda/programmatic_launch.cuh"
+#include "cuda/vec4.cuh"
 #include "transfer/momentum.cuh"
 
 // G2P, gather, and the two adjoints that read nodes. A thread processes one particle and sums over its support one axis
@@ -72,7 +72,7 @@ bool is_vector(const NodeField<const T>& n) {
 template <bool Quads, int K, class T>
 __device__ void load_node(const NodeField<const T>& nodes, int row, int offset, T (&node)[K]) {
   if constexpr (Quads) {
-    const Quad<T> quad = load_quad(nodes.pointer + int64_t(row) * 4 + offset * 4 - (K == 3));
+    const Vec4<T> quad = load_vec4(nodes.pointer + int64_t(row) * 4 + offset * 4 - (K == 3));
 #pragma unroll
     for (int c = 0; c < K; c++) node[c] = quad.e[K == 3 ? c + 1 : c];
   } else {
@@ -231,10 +231,10 @@ template <class Task>
 constexpr int kResident = Task::Order == 2 && sizeof(typename Task::T) == 4 ? Task::resident : 2;
 
 // Counts of particle places by the threads of whole warps; `lost` are bits of Drift::Loss.
-__device__ inline void add_to_drift(Drift* drift, int strays, int lost) {
-  const int all = __reduce_add_sync(~0u, strays);
-  if (all > 0 && threadIdx.x % 32 == 0) atomicAdd(&drift->strays, all);
-  if (lost) atomicOr(&drift->lost, lost);
+__device__ inline void add_to_displacement(Displacement* displacement, int out_of_block, int lost) {
+  const int all = __reduce_add_sync(~0u, out_of_block);
+  if (all > 0 && threadIdx.x % 32 == 0) atomicAdd(&displacement->out_of_block, all);
+  if (lost) atomicOr(&displacement->lost, lost);
 }
 
 // Whether particles that move may stay in their activation for another step.
@@ -257,7 +257,9 @@ class Follower {
       leave(t, home.scene, x);
   }
 
-  __device__ void tell(Drift* drift) const { add_to_drift(drift, strays_, lost_ ? Drift::kLost : 0); }
+  __device__ void flush_counters(Displacement* displacement) const {
+    add_to_displacement(displacement, out_of_block_, lost_ ? Displacement::kLost : 0);
+  }
 
   // Bits of the active neighbours of a slot.
   __device__ static unsigned active_blocks(const Topology<T, D>& t, int slot) {
@@ -277,23 +279,23 @@ class Follower {
     int base[D];
     T f[D];
     const int slot = locate_slot<Order>(t, scene, x, base, f);
-    strays_++;
+    out_of_block_++;
     lost_ = lost_ || slot < 0 || (touched_blocks<Order, D>(base) & ~active_blocks(t, slot)) != 0;
   }
 
-  int strays_ = 0;
+  int out_of_block_ = 0;
   bool lost_ = false;
 };
 
 // Task: topology, nodes, position; load(p, scene), inputs of a particle; compute(loaded, weights, support), its result;
-// write(p, loaded, result), with a result of zeros where positions are not those of the activation; leave_out(p) for a
-// particle outside. With drift, particles may be in active blocks other than those of the activation, write(...)
-// returns their new place, and there is a drift to add it to. With `Others`, that many channels of the nodes `others`
-// have a separate support, the last argument of compute(...). If it has a test whether an activation is due, particles
-// are in the order of items, except for one activation. If it may load ahead, it states whether the previous kernel
-// writes only nodes.
+// write(p, loaded, result), with a result of zeros where positions are not those of the activation; skip(p) for a
+// particle outside. If particles may be displaced, that is, in active blocks other than those of the activation,
+// write(...) returns their new place, and there are counters of the displacement. With `Others`, that many channels of
+// the nodes `others` have a separate support, the last argument of compute(...). If it has a test whether an activation
+// is due, particles are in the order of items, except for one activation. If it may load ahead, it states whether the
+// previous kernel writes only nodes.
 template <class Task>
-constexpr bool may_drift = requires { requires Task::drifts; };
+constexpr bool may_be_displaced = requires { requires Task::displaced; };
 template <class Task>
 constexpr int kOthers = 0;
 template <class Task>
@@ -340,7 +342,7 @@ __device__ void gather_in_memory_order(const Task& task, const Schedule<const in
   using T = typename Task::T;
   constexpr int D = Task::D;
   const Topology<T, D>& t = task.topology;
-  wait_for_kernel_before();
+  grid_dependency_sync();
   const int64_t stride = int64_t(gridDim.x) * kGatherThreads;
 #pragma unroll 1
   for (int64_t i = int64_t(blockIdx.x) * kGatherThreads + threadIdx.x; i < t.particles; i += stride) {
@@ -351,12 +353,12 @@ __device__ void gather_in_memory_order(const Task& task, const Schedule<const in
     GridSupport<T, Task::K, D, Quads> support{task.nodes};
     T f[D];
     if (slot >= 0 && !locate_in_block<Task::Order>(t, scene, base_block, x, support.base, f))
-      slot = may_drift<Task> ? locate_slot<Task::Order>(t, scene, x, support.base, f) : -1;
+      slot = may_be_displaced<Task> ? locate_slot<Task::Order>(t, scene, x, support.base, f) : -1;
     if (slot < 0) {
-      task.leave_out(p);
+      task.skip(p);
       continue;
     }
-    if constexpr (may_drift<Task>) {
+    if constexpr (may_be_displaced<Task>) {
       const Vector<T, D> to = gather_from_grid<Quads>(task, schedule, p, scene, slot, support, f);
       BaseBlock<T, D> home;
       home.template set<Task::Order>(t, base_block);
@@ -390,20 +392,21 @@ __device__ void load_tile(const NodeField<const T>& nodes, const int* slots, Nod
 
 // Strays of an item, processed after its other particles.
 template <bool Quads, class Task, int Most>
-__device__ void gather_strays(const Task& task, const Schedule<const int>& schedule, const Strays<Most>& strays,
-                              int begin, const BaseBlock<typename Task::T, Task::D>& home, unsigned active,
-                              FollowerOf<Task>& follower) {
+__device__ void gather_out_of_block(const Task& task, const Schedule<const int>& schedule,
+                                    const OutOfBlockList<Most>& out_of_block, int begin,
+                                    const BaseBlock<typename Task::T, Task::D>& home, unsigned active,
+                                    FollowerOf<Task>& follower) {
   using T = typename Task::T;
   const Topology<T, Task::D>& t = task.topology;
   __syncthreads();
 #pragma unroll 1
-  for (int s = threadIdx.x; s < strays.count; s += kGatherThreads) {
-    const int p = t.index[begin + strays.particle[s]];
+  for (int s = threadIdx.x; s < out_of_block.count; s += kGatherThreads) {
+    const int p = t.index[begin + out_of_block.particle[s]];
     GridSupport<T, Task::K, Task::D, Quads> support{task.nodes};
     T f[Task::D];
     const int slot = locate_slot<Task::Order>(t, home.scene, read_vector(task.position, p), support.base, f);
     if (slot < 0) {
-      task.leave_out(p);
+      task.skip(p);
       continue;
     }
     follower.follow(t, home, active, gather_from_grid<Quads>(task, schedule, p, home.scene, slot, support, f));
@@ -415,7 +418,7 @@ __device__ void gather_by_items(const Task& task, const Schedule<const int>& sch
   using T = typename Task::T;
   constexpr int D = Task::D, K = Task::K, others = kOthers<Task>, width = kBlockWidth + Task::Order;
   constexpr int size = D == 2 ? width * width : width * width * width;
-  __shared__ Strays<may_drift<Task> ? kItemParticles : 1> strays;
+  __shared__ OutOfBlockList<may_be_displaced<Task> ? kItemParticles : 1> out_of_block;
   __shared__ BaseBlock<T, D> home;
   __shared__ NodeValue<T, K> tile[size];
   __shared__ NodeValue<T, others ? others : 1> others_tile[others ? size : 1];
@@ -432,13 +435,13 @@ __device__ void gather_by_items(const Task& task, const Schedule<const int>& sch
     Vector<T, D> x = read_vector(task.position, p);
     __syncthreads();  // the previous tile is done
     if (threadIdx.x < 1 << D) slots[threadIdx.x] = schedule.neighbours[(item.x << D) + threadIdx.x];
-    if (may_drift<Task> && threadIdx.x == 32) home.template set<Task::Order>(t, base_block);
-    if (may_drift<Task> && threadIdx.x == 64) strays.count = 0;
-    const unsigned active = may_drift<Task> ? FollowerOf<Task>::active_blocks(t, item.x) : 0;
+    if (may_be_displaced<Task> && threadIdx.x == 32) home.template set<Task::Order>(t, base_block);
+    if (may_be_displaced<Task> && threadIdx.x == 64) out_of_block.count = 0;
+    const unsigned active = may_be_displaced<Task> ? FollowerOf<Task>::active_blocks(t, item.x) : 0;
     typename Task::Loaded loaded;
     if constexpr (may_load_ahead<Task>) loaded = task.load(p, scene);
     __syncthreads();
-    wait_for_kernel_before();
+    grid_dependency_sync();
     load_tile<Quads, Task::Order, T, K, D>(task.nodes, slots, tile);
     if constexpr (others > 0) load_tile<Quads, Task::Order, T, others, D>(task.others, slots, others_tile);
     __syncthreads();
@@ -460,28 +463,29 @@ __device__ void gather_by_items(const Task& task, const Schedule<const int>& sch
         else
           return task.compute(loaded, weights, support);
       }();
-      if constexpr (!may_drift<Task>)
+      if constexpr (!may_be_displaced<Task>)
         task.write(p, loaded, in_block ? result : typename Task::Result{});
       else if (in_block)
         follower.follow(t, home, active, task.write(p, loaded, result));
       else
-        strays.particle[atomicAdd(&strays.count, 1)] = uint16_t(k - begin);
+        out_of_block.particle[atomicAdd(&out_of_block.count, 1)] = uint16_t(k - begin);
       p = p_next;
       p_next = p_after;
       x = x_next;
     }
-    if constexpr (may_drift<Task>) gather_strays<Quads>(task, schedule, strays, begin, home, active, follower);
+    if constexpr (may_be_displaced<Task>)
+      gather_out_of_block<Quads>(task, schedule, out_of_block, begin, home, active, follower);
   }
-  wait_for_kernel_before();
+  grid_dependency_sync();
   const int64_t stride = int64_t(gridDim.x) * kGatherThreads;
   for (int64_t i = t.offsets[t.max_blocks] + int64_t(blockIdx.x) * kGatherThreads + threadIdx.x; i < t.particles;
        i += stride)
-    task.leave_out(t.index[i]);
+    task.skip(t.index[i]);
 }
 
 template <bool Quads, class Task>
 __global__ void __launch_bounds__(kGatherThreads, kResident<Task>) gather_kernel(const Task task) {
-  if (!loads_ahead(task)) wait_for_kernel_before();
+  if (!loads_ahead(task)) grid_dependency_sync();
   const Schedule<const int> schedule = schedule_of(task.topology);
   FollowerOf<Task> follower;
   if constexpr (requires { task.is_due(); }) {
@@ -492,7 +496,7 @@ __global__ void __launch_bounds__(kGatherThreads, kResident<Task>) gather_kernel
   } else {
     gather_by_items<Quads>(task, schedule, follower);
   }
-  if constexpr (may_drift<Task>) follower.tell(task.drift);
+  if constexpr (may_be_displaced<Task>) follower.flush_counters(task.displacement);
 }
 
 template <class Task, class Kernel>

@@ -10,11 +10,11 @@
 namespace mpm {
 
 struct OwnRows {
-  int rows = 0;                  // rows of a copy; 0 without owned particles
-  const Drift* drift = nullptr;  // states whether there is a new activation; null where there always is
+  int rows = 0;                                // rows of a copy; 0 without owned particles
+  const Displacement* displacement = nullptr;  // states whether there is a new activation; null where there always is
 
-  bool is_mostly_idle() const { return drift != nullptr; }
-  MPM_HD bool is_due(int64_t particles) const { return !drift || !drift->lasts(particles); }
+  bool is_mostly_idle() const { return displacement != nullptr; }
+  MPM_HD bool is_due(int64_t particles) const { return !displacement || !displacement->lasts(particles); }
   // For a row of either copy.
   MPM_HD int place(int row) const { return row >= rows ? row - rows : row; }
   MPM_HD int in_other_copy(int row, int place) const { return row >= rows ? place : place + rows; }
@@ -22,7 +22,7 @@ struct OwnRows {
 
 // For P2G, which moves the particles.
 template <class T, int D>
-struct Settling : OwnRows {
+struct ReorderOnScatter : OwnRows {
   bool given = false;                     // whether they are in given tensors
   Field<T> x, mass, volume, residual;     // of both copies, as all fields are; no residual where there is none
   Field<const T> residual_before;         // source
@@ -32,7 +32,7 @@ struct Settling : OwnRows {
 
 // For G2P, which reads and writes velocities by the place in a copy; or in the given tensors, at the end of the call.
 template <class T>
-struct GivingBack : OwnRows {
+struct RestoreOrder : OwnRows {
   const int* origin = nullptr;
   int columns = 0;  // for the history
   Field<const T> history;

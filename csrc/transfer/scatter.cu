@@ -7,7 +7,7 @@ template <int Order, class T, int D, int K, bool Gradient>
 struct FieldSource {
   using Shape = ScatterShape<Order, T, D, 0, K, Gradient>;
   static constexpr int resident = 0;
-  static constexpr bool drifts = false;
+  static constexpr bool displaced = false;
   Topology<T, D> topology;
   NodeField<T> nodes;
   Columns<const T, D> position;
@@ -47,16 +47,16 @@ struct FieldSource {
 
 template <int Order, class T, int D>
 void p2g(const P2GArguments<T, D>& a, Stream stream) {
-  const auto with = [&]<Stress Kind, bool Drifts>() {
-    launch_scatter(MomentumSource<Order, T, D, Kind, Drifts>(a), a.deterministic, stream);
+  const auto with = [&]<Stress Kind, bool Displaced>() {
+    launch_scatter(MomentumSource<Order, T, D, Kind, Displaced>(a), a.deterministic, stream);
   };
   if (!a.stress.pointer)
     with.template operator()<Stress::none, false>();
   else if (a.form == StressForm::mls)
-    a.drifted ? with.template operator()<Stress::moment, true>() : with.template operator()<Stress::moment, false>();
+    a.displaced ? with.template operator()<Stress::moment, true>() : with.template operator()<Stress::moment, false>();
   else
-    a.drifted ? with.template operator()<Stress::gradient, true>()
-              : with.template operator()<Stress::gradient, false>();
+    a.displaced ? with.template operator()<Stress::gradient, true>()
+                : with.template operator()<Stress::gradient, false>();
 }
 
 template <int Order, class T, int D>

@@ -1,8 +1,8 @@
 #pragma once
 
-#include "cuda/chain.cuh"
 #include "cuda/fixed_point.cuh"
-#include "cuda/quad.cuh"
+#include "cuda/programmatic_launch.cuh"
+#include "cuda/vec4.cuh"
 #include "transfer/momentum.cuh"
 
 // The kernel of P2G and scatter. One thread block processes the particles of one item, links them by cell in shared
@@ -76,14 +76,14 @@ struct SharedParticles {
   using T = typename S::T;
   using Link = typename S::Link;
   static constexpr Link end = Link(-1);
-  Quad<T>* quads;  // [quads, batch]
+  Vec4<T>* quads;  // [quads, batch]
   Pair<T>* pairs;  // [pairs, batch]
   Link* next;      // [batch]
   int* head;       // [lists + 1]
   int room;        // where S::batch is 0, instead of it
 
   __device__ SharedParticles(char* memory, int* head, int room = S::batch) : head(head), room(room) {
-    quads = reinterpret_cast<Quad<T>*>(memory);
+    quads = reinterpret_cast<Vec4<T>*>(memory);
     pairs = reinterpret_cast<Pair<T>*>(quads + S::quads * batch());
     next = reinterpret_cast<Link*>(pairs + S::pairs * batch());
   }
@@ -125,7 +125,7 @@ template <class S, class T>
 __device__ void load_words(const SharedParticles<S>& shared, int row, T (&word)[kWords<S>]) {
 #pragma unroll
   for (int q = 0; q < S::quads; q++) {
-    const Quad<T> v = shared.quads[q * shared.batch() + row];
+    const Vec4<T> v = shared.quads[q * shared.batch() + row];
 #pragma unroll
     for (int e = 0; e < 4; e++) word[4 * q + e] = v.e[e];
   }
@@ -339,7 +339,7 @@ __device__ void order_by_cell(const Source& source, const Topology<T, D>& t, con
 // Loads the particles index[begin, begin + n) of a block into shared memory and links them by cell.
 template <class S, class Source, int Most, class T, int D>
 __device__ void load_particles(const Source& source, const Topology<T, D>& t, int block, BaseBlock<T, D>& base_block,
-                               const SharedParticles<S>& shared, Strays<Most>& strays, int begin, int n,
+                               const SharedParticles<S>& shared, OutOfBlockList<Most>& out_of_block, int begin, int n,
                                bool in_order) {
   constexpr bool may_settle = requires { source.settles(); };
   __shared__ CellOrder<std::conditional_t<may_settle, S, NoCells>> order;
@@ -347,7 +347,7 @@ __device__ void load_particles(const Source& source, const Topology<T, D>& t, in
   if constexpr (may_settle) settles = source.settles();
   int following = int(threadIdx.x) < n && !settles ? t.index[begin + threadIdx.x] : 0;
   if (threadIdx.x == 32) base_block.template set<S::Order>(t, block);
-  if (threadIdx.x == 0) strays.count = 0;
+  if (threadIdx.x == 0) out_of_block.count = 0;
   empty_lists<S>(shared.head);
   __syncthreads();
   if constexpr (may_settle)
@@ -373,7 +373,7 @@ __device__ void load_particles(const Source& source, const Topology<T, D>& t, in
     }();
     const int list = list_of<S>(k, in_block, cell);
     store_particle<S, T, D>(shared, row, f, source.contribution(loaded));
-    if (Source::drifts && !in_block) strays.particle[atomicAdd(&strays.count, 1)] = uint16_t(k);
+    if (Source::displaced && !in_block) out_of_block.particle[atomicAdd(&out_of_block.count, 1)] = uint16_t(k);
     shared.next[row] = uint16_t(in_order ? list : atomicExch(&shared.head[list], row));
   }
   __syncthreads();
@@ -495,7 +495,8 @@ __device__ void node_value(const SharedParticles<S>& shared, int row, const int 
 // Nodes of the support of one particle, by a warp, one lane per node: node_row(offset) is the row of the node, -1 in an
 // inactive block.
 template <class S, class Nodes, class NodeRow>
-__device__ void add_stray(const Nodes& nodes, const SharedParticles<S>& shared, int row, const NodeRow& node_row) {
+__device__ void add_one_out_of_block(const Nodes& nodes, const SharedParticles<S>& shared, int row,
+                                     const NodeRow& node_row) {
   using T = typename S::T;
   constexpr int D = S::D, count = D == 2 ? S::support * S::support : S::support * S::slab;
   for (int n = threadIdx.x % 32; n < count; n += 32) {
@@ -524,11 +525,11 @@ __device__ void add_stray(const Nodes& nodes, const SharedParticles<S>& shared, 
 
 // The same for a particle whose base node is in the row `first`.
 template <class S, class Nodes>
-__device__ void add_stray(const Nodes& nodes, const Schedule<const int>& schedule, const SharedParticles<S>& shared,
-                          int row, int first) {
+__device__ void add_one_out_of_block(const Nodes& nodes, const Schedule<const int>& schedule,
+                                     const SharedParticles<S>& shared, int row, int first) {
   constexpr int D = S::D;
   const int slot = first / kBlockNodes<D>;
-  add_stray<S>(nodes, shared, row, [&](const int (&offset)[D]) -> int64_t {
+  add_one_out_of_block<S>(nodes, shared, row, [&](const int (&offset)[D]) -> int64_t {
     int node[D], neighbour = 0;
 #pragma unroll
     for (int i = D - 1, base = first; i >= 0; i--, base /= kBlockWidth) {
@@ -543,16 +544,16 @@ __device__ void add_stray(const Nodes& nodes, const Schedule<const int>& schedul
 // Strays of a batch index[begin, ...) are added to the nodes without a tile. Each lane finds one, so that its loads do
 // not wait for those of others, and then the warp processes them in turn.
 template <class S, class Source, class Nodes, int Most, class T, int D>
-__device__ void add_strays(const Source& source, const Nodes& nodes, const Topology<T, D>& t,
-                           const Schedule<const int>& schedule, int scene, const SharedParticles<S>& shared,
-                           const Strays<Most>& strays, int begin) {
+__device__ void add_out_of_block(const Source& source, const Nodes& nodes, const Topology<T, D>& t,
+                                 const Schedule<const int>& schedule, int scene, const SharedParticles<S>& shared,
+                                 const OutOfBlockList<Most>& out_of_block, int begin) {
   constexpr int warps = S::threads / 32;
   const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
-  for (int start = warp; start < strays.count; start += 32 * warps) {
+  for (int start = warp; start < out_of_block.count; start += 32 * warps) {
     const int s = start + warps * lane;
     int first = -1, row = 0;
-    if (s < strays.count) {
-      const int k = strays.particle[s], p = t.index[begin + k];
+    if (s < out_of_block.count) {
+      const int k = out_of_block.particle[s], p = t.index[begin + k];
       int base[D];
       T f[D];
       const int slot = locate_slot<S::Order>(t, scene, read_vector(source.position, p), base, f);
@@ -561,7 +562,7 @@ __device__ void add_strays(const Source& source, const Nodes& nodes, const Topol
     }
     for (unsigned left = __ballot_sync(~0u, first >= 0); left; left &= left - 1) {
       const int from = __ffs(left) - 1;
-      add_stray(nodes, schedule, shared, __shfl_sync(~0u, row, from), __shfl_sync(~0u, first, from));
+      add_one_out_of_block(nodes, schedule, shared, __shfl_sync(~0u, row, from), __shfl_sync(~0u, first, from));
     }
   }
 }
@@ -574,7 +575,7 @@ __device__ void put_slab(const T (&sum)[S::slab][S::channels], T* sums) {
   for (int n = 0; n < S::part; n++) {
     const auto& node = sum[Round * S::part + n];
     if constexpr (S::channels == 4) {
-      reinterpret_cast<Quad<T>*>(to)[n] = {node[0], node[1], node[2], node[3]};
+      reinterpret_cast<Vec4<T>*>(to)[n] = {node[0], node[1], node[2], node[3]};
     } else {
 #pragma unroll
       for (int c = 0; c < S::channels; c++) to[n * S::channels + c] = node[c];
@@ -617,14 +618,14 @@ __device__ T word_sum(const T* sums, int (&node)[S::D], int word) {
 // Four words of a row of the tile, from one on; where these are not the words of a node, each lane has one of them, and
 // the first lane all.
 template <class S, int Round, class T>
-__device__ Quad<T> quad_sum(const T* sums, int (&node)[S::D], int first_word, bool exists) {
-  Quad<T> sum{};
+__device__ Vec4<T> quad_sum(const T* sums, int (&node)[S::D], int first_word, bool exists) {
+  Vec4<T> sum{};
   if constexpr (S::channels == 4) {
     if (!exists) return sum;
     node[S::D - 1] = first_word / 4;
     each_slab<S, Round>(node, [&](int place, bool reaches) {
-      Quad<T> v{};
-      if (reaches) v = reinterpret_cast<const Quad<T>*>(sums)[place];
+      Vec4<T> v{};
+      if (reaches) v = reinterpret_cast<const Vec4<T>*>(sums)[place];
 #pragma unroll
       for (int e = 0; e < 4; e++) sum.e[e] += v.e[e];
     });
@@ -651,7 +652,7 @@ __device__ void flush_tile(const Nodes& nodes, const int slots[1 << D], const T*
 #pragma unroll
     for (int i = 0; i < D - 1; i++) neighbour = neighbour * 2 + (node[i] >= kBlockWidth);
     const int slot = t < count ? slots[neighbour * 2 + far] : -1;
-    const Quad<T> value = quad_sum<S, Round>(sums, in_tile, first_word + far * kBlockWidth * K, slot >= 0);
+    const Vec4<T> value = quad_sum<S, Round>(sums, in_tile, first_word + far * kBlockWidth * K, slot >= 0);
     if (slot < 0 || t % lanes != 0) continue;
     if (value.e[0] == T(0) && value.e[1] == T(0) && value.e[2] == T(0) && value.e[3] == T(0)) continue;
     const int64_t row = int64_t(slot) * kBlockNodes<D> + node_in_block<D>(node);
@@ -672,9 +673,9 @@ __device__ void flush_tile(const Nodes& nodes, const int slots[1 << D], const T*
 
 // Adds the particles in shared memory to the nodes; `add_strays` adds those in no list. `when_added` is called when
 // their memory is no longer needed. All threads have to wait before that memory is reused.
-template <class S, class Nodes, class AddStrays, class WhenAdded>
+template <class S, class Nodes, class AddOutOfBlock, class WhenAdded>
 __device__ void add_particles(const Nodes& nodes, const SharedParticles<S>& shared, const int* slots, bool in_order,
-                              const AddStrays& add_strays, const WhenAdded& when_added) {
+                              const AddOutOfBlock& add_out_of_block, const WhenAdded& when_added) {
   using T = typename S::T;
   T* const sums = reinterpret_cast<T*>(shared.quads);
   const Walker<S> walker;
@@ -685,7 +686,7 @@ __device__ void add_particles(const Nodes& nodes, const SharedParticles<S>& shar
     add_particle(shared, walker, row, sum);
     row = following;
   }
-  add_strays();
+  add_out_of_block();
   __syncthreads();
   put_slab<S, 0>(sum, sums);
   when_added();
@@ -699,45 +700,45 @@ __device__ void add_particles(const Nodes& nodes, const SharedParticles<S>& shar
   }
 }
 
-template <class S, class Nodes, class AddStrays>
+template <class S, class Nodes, class AddOutOfBlock>
 __device__ void add_particles(const Nodes& nodes, const SharedParticles<S>& shared, const int* slots, bool in_order,
-                              const AddStrays& add_strays) {
-  add_particles(nodes, shared, slots, in_order, add_strays, [] {});
+                              const AddOutOfBlock& add_out_of_block) {
+  add_particles(nodes, shared, slots, in_order, add_out_of_block, [] {});
 }
 
 // Shared memory of the thread blocks of P2G beside the particles and the sums, which follow one another there.
-template <class S, bool Drifts>
+template <class S, bool Displaced>
 struct ScatterMemory {
   int slots[1 << S::D], head[S::lists + 1];
   BaseBlock<typename S::T, S::D> base_block;
-  Strays<Drifts ? S::batch : 1> strays;
+  OutOfBlockList<Displaced ? S::batch : 1> out_of_block;
 };
 
 // Adds the particles of an item to the nodes; `memory` is dynamic shared memory of S::shared_bytes.
 template <class Source>
 __device__ void scatter_item(const Source& source, const Topology<typename Source::Shape::T, Source::Shape::D>& t,
                              const Item& item, bool in_order, char* memory,
-                             ScatterMemory<typename Source::Shape, Source::drifts>& m) {
+                             ScatterMemory<typename Source::Shape, Source::displaced>& m) {
   using S = typename Source::Shape;
   using T = typename S::T;
   constexpr int D = S::D;
   const SharedParticles<S> shared(memory, m.head);
   const int slot = threadIdx.x < 1 << D ? schedule_of(t).neighbours[(item.slot << D) + threadIdx.x] : -1;
   for (int begin = item.begin; begin < item.end; begin += S::batch) {
-    load_particles<S>(source, t, item.block, m.base_block, shared, m.strays, begin, min(S::batch, item.end - begin),
-                      in_order || is_fixed(source.nodes));
+    load_particles<S>(source, t, item.block, m.base_block, shared, m.out_of_block, begin,
+                      min(S::batch, item.end - begin), in_order || is_fixed(source.nodes));
     if (threadIdx.x < 1 << D) m.slots[threadIdx.x] = slot;
     add_particles(source.nodes, shared, m.slots, in_order, [&] {
-      if constexpr (Source::drifts)
-        add_strays<S>(source, source.nodes, t, schedule_of(t), m.base_block.scene, shared, m.strays, begin);
+      if constexpr (Source::displaced)
+        add_out_of_block<S>(source, source.nodes, t, schedule_of(t), m.base_block.scene, shared, m.out_of_block, begin);
     });
     __syncthreads();
   }
 }
 
-// Source: topology, nodes, position; whether particles may have drifted; load(p, scene), or load(p, scene, place) with
+// Source: topology, nodes, position; whether particles may be displaced; load(p, scene), or load(p, scene, place) with
 // its place in the index, the inputs of a particle; contribution(loaded), its contribution; and optionally is_due(),
-// whether there is work, and leave_out(p, place) for a particle outside.
+// whether there is work, and skip(p, place) for a particle outside.
 //
 // colour < 0: every item, with atomics. Otherwise the base blocks of that colour, whole, without atomics.
 template <class Source>
@@ -746,11 +747,11 @@ __global__ void __launch_bounds__(Source::Shape::threads, Source::resident)
   using S = typename Source::Shape;
   using T = typename S::T;
   constexpr int D = S::D;
-  wait_for_kernel_before();
+  grid_dependency_sync();
   if constexpr (requires { source.is_due(); })
     if (!source.is_due()) return;
   extern __shared__ __align__(16) char memory[];
-  __shared__ ScatterMemory<S, Source::drifts> shared;
+  __shared__ ScatterMemory<S, Source::displaced> shared;
   const Topology<T, D>& t = source.topology;
   const Schedule<const int> schedule = schedule_of(t);
   const bool in_order = colour >= 0;
@@ -767,11 +768,11 @@ __global__ void __launch_bounds__(Source::Shape::threads, Source::resident)
     }
     scatter_item(source, t, item, in_order, memory, shared);
   }
-  if constexpr (requires { source.leave_out(0, 0); }) {
+  if constexpr (requires { source.skip(0, 0); }) {
     const int64_t stride = int64_t(gridDim.x) * S::threads;
     for (int64_t i = t.offsets[t.max_blocks] + int64_t(blockIdx.x) * S::threads + threadIdx.x; i < t.particles;
          i += stride)
-      source.leave_out(t.index[i], int(i));
+      source.skip(t.index[i], int(i));
   }
 }
 
@@ -788,9 +789,9 @@ void launch_scatter(const Source& source, bool deterministic, Stream stream) {
 enum class Stress { none, moment, gradient };
 
 // Drifts: particles may be in active blocks other than those of the activation.
-template <int Order, class T, int D, Stress Kind, bool Drifts>
+template <int Order, class T, int D, Stress Kind, bool Displaced>
 struct MomentumSource {
-  static constexpr bool drifts = Drifts;
+  static constexpr bool displaced = Displaced;
   static constexpr bool with_stress = Kind != Stress::none, gradient = Kind == Stress::gradient;
   using Shape = ScatterShape<Order, T, D, 1, D, gradient>;
   // With fewer registers the loads of the stress would wait for each other.

@@ -4,21 +4,21 @@
 #include "transfer/advance_gather.cuh"
 #include "transfer/scatter.cuh"
 
-// The kernel of resident scenes, for any source of P2G and task of G2P. A substep of a scene is
+// The kernel with a thread block per scene, for any source of P2G and task of G2P. A substep of a scene is
 //   particles   law and contribution of each particle, in lists by cell
-//   columns     the rows of cells of a block along the last axis that have particles, in their order; empty nodes
-//   walk        the particles of each column, or of each of its cells, summed up by a thread per leading node, then
+//   columns     the rows of cells of a block along the last axis that have particles, in their order; cleared nodes
+//   walk        sums over the particles of each column, or of each of its cells, by a thread per leading node, then
 //               added to the nodes in turns, no two threads to the same node at a time
 //   nodes       grid update and contact
 //   particles   G2P, and the blocks that the particles touch next.
-// Where the activation is deterministic, lists have the order of the index tensor, and sums so, too.
+// In deterministic activations lists, and therefore sums, have the order of the index tensor.
 namespace mpm::cuda {
 
-constexpr int kResidentThreads = 512;  // at most
+constexpr int kMostSceneThreads = 512;  // at most
 
 template <class Shape>
-struct ResidentShape : Shape {
-  static constexpr int batch = 0;  // known at run time alone
+struct SceneShape : Shape {
+  static constexpr int batch = 0;  // known at run time only
   using Link = int;
   static constexpr int row_bytes = Shape::row_bytes + int(sizeof(Link) - sizeof(typename Shape::Link));
 };
@@ -45,24 +45,24 @@ struct SceneBlocks {
   }
 };
 
-// What the threads of a scene share beside its particles and nodes.
+// Values shared by the threads of a scene, beside its particles and nodes.
 struct SceneState {
   int begin, end;                                            // particles index[begin, end)
   int blocks;                                                // numbered
   int columns;                                               // with particles
   int grown;                                                 // whether a particle touches a block without a number
   int outside, first_outside, not_finite, first_not_finite;  // of this substep; first as largest complement
-  int columns_before[kResidentThreads / 32];                 // each warp
+  int columns_before[kMostSceneThreads / 32];                // each warp
   char* more_blocks;
   int more_room;
 };
 
-// Where all of a scene stays in shared memory, Spills is false, and all loads and stores are those of shared memory.
+// Spills is false if the whole scene is in shared memory; all loads and stores are then those of shared memory.
 template <class Source, class Task, bool Spills>
 class SceneStep {
  public:
   using T = typename Source::Shape::T;
-  using S = ResidentShape<typename Source::Shape>;
+  using S = SceneShape<typename Source::Shape>;
   static constexpr int D = S::D, Order = S::Order, count = kBlockNodes<D>;
   static constexpr int cells = kBlockWidth, rows_of_slab = S::slab / S::support;  // of a column
   using Blocks = SceneBlocks<T, D>;
@@ -70,13 +70,13 @@ class SceneStep {
 
   const Source& source;
   const Task& task;
-  const ResidentArguments<T, D>& a;
+  const BlockPerSceneArguments<T, D>& a;
   const int scene;
   SceneState& state;
-  int* const table;        // [blocks_per_scene] numbers of blocks, -1 where there is none
-  unsigned* const wanted;  // a bit for each block that wants a number
+  int* const table;        // [blocks_per_scene] numbers of blocks, -1 without a number
+  unsigned* const wanted;  // a bit for each block that needs a number
   Rows rows;
-  int* const columns;  // [particles] those that have particles
+  int* const columns;  // [particles] columns with particles
   Blocks blocks;
   GridUpdateArguments<T, D>& update;  // with the blocks of this scene
   ContactArguments<T, D>& contact;
@@ -153,9 +153,9 @@ class SceneStep {
     __syncthreads();
   }
 
-  // Numbers the blocks anew where particles touch others. Where room runs out, blocks that nobody touches are given up
-  // first. If that is not enough, blocks move to global memory where the scene Spills, and false means that there is
-  // none left; else false means that the scene has to go on as one that does.
+  // Renumbers the blocks if particles touch new ones. If there is no room, blocks without particles are dropped first.
+  // If that does not suffice and the scene Spills, blocks move to global memory, and false means that none is left;
+  // otherwise false means that the scene has to continue with Spills.
   __device__ bool make_room(int64_t step) {
     if (!state.grown) return true;
     number();
@@ -182,7 +182,7 @@ class SceneStep {
     return true;
   }
 
-  // By one thread: spare blocks with some headroom, where there is none with just those wanted, or none.
+  // By one thread: takes spare blocks with some headroom, otherwise as many as needed, otherwise none.
   __device__ void take_spare_blocks() const {
     int first = *const_cast<volatile int*>(a.blocks_taken), room, found;
     do {
@@ -197,7 +197,7 @@ class SceneStep {
     state.more_blocks = a.blocks + int64_t(found) * int64_t(Blocks::bytes);
   }
 
-  // Without spilling it leaves an empty table for the one that spills.
+  // Without Spills the table is cleared for the instance with Spills.
   __device__ bool find_more(int64_t step) {
     if constexpr (Spills) {
       return take_more(step);
@@ -211,7 +211,7 @@ class SceneStep {
   __device__ bool take_more(int64_t step) {
     if (threadIdx.x == 0) {
       take_spare_blocks();
-      if (state.more_room == 0) a.trouble[scene].full = int(step) + 1, a.trouble[scene].wanted = state.blocks;
+      if (state.more_room == 0) a.errors[scene].full = int(step) + 1, a.errors[scene].wanted = state.blocks;
     }
     __syncthreads();
     if (state.more_room == 0) return false;
@@ -231,7 +231,7 @@ class SceneStep {
       int base[D];
       T f[D];
       if (!locate<Order>(geometry(), x.e, base, f)) {
-        leave_out(p, x);
+        skip(p, x);
         continue;
       }
       const int row = Rows::row(k), cell = cell_of(base);
@@ -240,15 +240,15 @@ class SceneStep {
     }
   }
 
-  __device__ void leave_out(int p, const Vector<T, D>& x) const {
+  __device__ void skip(int p, const Vector<T, D>& x) const {
     const bool finite = is_finite<D>(x.e);
     atomicAdd(finite ? &state.outside : &state.not_finite, 1);
     atomicMax(finite ? &state.first_outside : &state.first_not_finite, INT_MAX - p);
   }
 
-  // Of the first substep with trouble.
-  __device__ void tell(int64_t step) const {
-    SceneTrouble& t = a.trouble[scene];
+  // Stores the errors of the first substep with an error.
+  __device__ void report_errors(int64_t step) const {
+    SceneErrors& t = a.errors[scene];
     if (threadIdx.x > 0 || state.outside + state.not_finite == 0) return;
     if (t.step == 0)
       t = {int(step) + 1,
@@ -261,8 +261,7 @@ class SceneStep {
     state.outside = state.not_finite = state.first_outside = state.first_not_finite = 0;
   }
 
-  // Puts the list of a cell into the order of its particles. It comes nearly in the reverse order, which takes one
-  // pass.
+  // Sorts the list of a cell by particle. It mostly has the reverse order, which needs one pass.
   __device__ void sort_list(int cell) const {
     int first = Rows::end;
     for (int row = blocks.head[cell]; row != Rows::end;) {
@@ -295,7 +294,7 @@ class SceneStep {
       mine += __popc(__ballot_sync(~0u, first + lane < end && has_particles(first + lane)));
     if (lane == 0) state.columns_before[warp] = mine;
     for (int i = threadIdx.x; i < state.blocks * (count * (1 + D) / 4); i += blockDim.x)
-      store_quad(blocks.node + 4 * i, Quad<T>{});
+      store_vec4(blocks.node + 4 * i, Vec4<T>{});
     __syncthreads();
     int number = __reduce_add_sync(~0u, lane < warp ? state.columns_before[lane] : 0);
     for (int first = begin; first < end; first += 32) {
@@ -313,8 +312,8 @@ class SceneStep {
     __syncthreads();
   }
 
-  // Rows of the nodes that a thread adds to: of each row of nodes behind its leading one, the one beside the first cell
-  // of the column, and that beyond the block, -1 where no particle of the column touches it.
+  // Rows of the nodes that a thread adds to: for each row of nodes behind its leading one, the node beside the first
+  // cell of the column, and the node beyond the block, -1 if no particle of the column touches it.
   struct Places {
     int near[rows_of_slab], far[rows_of_slab];
   };
@@ -347,14 +346,14 @@ class SceneStep {
   __device__ void add_to_nodes(int row, const T (*value)[S::channels]) const {
     T* const to = blocks.node + row * (1 + D);
     if constexpr (D == 3 && sizeof(T) == 4) {
-      Quad<T> v[Nodes];
+      Vec4<T> v[Nodes];
 #pragma unroll
-      for (int n = 0; n < Nodes; n++) v[n] = load_quad(to + 4 * n);
+      for (int n = 0; n < Nodes; n++) v[n] = load_vec4(to + 4 * n);
 #pragma unroll
       for (int n = 0; n < Nodes; n++) {
 #pragma unroll
         for (int c = 0; c < 4; c++) v[n].e[c] += value[n][c];
-        store_quad(to + 4 * n, v[n]);
+        store_vec4(to + 4 * n, v[n]);
       }
     } else {
 #pragma unroll
@@ -364,8 +363,8 @@ class SceneStep {
     }
   }
 
-  // Of rows of nodes behind a leading one, where each thread of a column has those of one cell, the n-th: what they
-  // give the node beside it, and the one beyond the block that is as far from the first of that.
+  // For rows of nodes behind a leading one, with a thread for each cell of a column (the n-th): the sums for the node
+  // beside the cell, and for the node beyond the block at the same distance from its first one.
   __device__ static void exchange(int n, const T (*sum)[S::channels], T (&near)[S::channels], T (&far)[S::channels]) {
 #pragma unroll
     for (int c = 0; c < S::channels; c++) near[c] = sum[0][c], far[c] = T(0);
@@ -475,7 +474,7 @@ class SceneStep {
     __syncthreads();
   }
 
-  // What G2P reads of the particles of the first round, which may be loaded while the nodes are updated.
+  // Inputs of G2P for the particles of the first round, loaded while the nodes are updated.
   __device__ typename Task::Loaded load_first() const { return task.load(first_particle(), scene); }
 
   __device__ void move_particles(typename Task::Loaded loaded) const {
@@ -490,7 +489,7 @@ class SceneStep {
       GridSupport<T, Task::K, D, quads> support{velocity};
       T f[D];
       if (!locate<Order>(geometry(), loaded.x.e, support.base, f)) {
-        task.leave_out(p);
+        task.skip(p);
         continue;
       }
       const int slot = table[block_of(support.base)];
@@ -502,22 +501,22 @@ class SceneStep {
   }
 };
 
-// Of particles outside the grid, which nothing moves, all substeps.
+// All substeps of particles outside the grid, which do not move.
 template <class Source, class Task>
-__device__ void leave_out_tail(const Source& source, const Task& task, int64_t steps) {
+__device__ void skip_tail(const Source& source, const Task& task, int64_t steps) {
   const auto& t = source.topology;
   for (int64_t i = t.offsets[t.max_blocks] + threadIdx.x; i < t.particles; i += blockDim.x) {
-    for (int64_t step = 0; step < steps; step++) source.leave_out(t.index[i]), task.leave_out(t.index[i]);
+    for (int64_t step = 0; step < steps; step++) source.skip(t.index[i]), task.skip(t.index[i]);
   }
 }
 
 template <class T, int D>
-__device__ void move_clock(const ResidentArguments<T, D>& a, int scene, int64_t steps) {
+__device__ void move_clock(const BlockPerSceneArguments<T, D>& a, int scene, int64_t steps) {
   if (threadIdx.x > 0 || !a.scene_time) return;
   for (int64_t step = 0; step < steps; step++) a.scene_time[scene] += a.dt * double(a.scene_dt[scene]);
 }
 
-// First slot of the blocks from one of the table on; unused slots come last.
+// First slot whose block is at or after a given one; unused slots come last.
 template <class T, int D>
 __device__ int first_slot(const Topology<T, D>& t, int block) {
   int begin = 0, end = t.max_blocks;
@@ -531,18 +530,19 @@ __device__ int first_slot(const Topology<T, D>& t, int block) {
   return begin;
 }
 
-// Of some particles: an array of SharedParticles, and room for their columns.
+// Bytes of an array of SharedParticles, and of their columns.
 template <class S>
 MPM_HD int64_t bytes_of_particles(int64_t particles) {
   return (particles + 63) / 64 * 64 * (S::row_bytes + int64_t(sizeof(int)));
 }
 
-// With a bit for each block.
+// Bytes of the table, with a bit for each block.
 MPM_HD int64_t bytes_of_table(int64_t blocks) {
   return (blocks + (blocks + 31) / 32 + 3) / 4 * 4 * int64_t(sizeof(int));
 }
 
-// Substeps of a scene from one on; returns where they end, before the last for want of shared memory alone.
+// Computes the substeps of a scene from `step` on; returns the next one, which is not the end only for lack of shared
+// memory.
 template <class Step>
 __device__ __forceinline__ int64_t run_scene(Step& s, int64_t step) {
   s.touch_all();
@@ -552,7 +552,7 @@ __device__ __forceinline__ int64_t run_scene(Step& s, int64_t step) {
     if (!s.make_room(step)) return step;
     s.load_particles();
     __syncthreads();
-    s.tell(step);
+    s.report_errors(step);
     s.list_columns();
     s.walk();
     const auto loaded = s.load_first();
@@ -567,10 +567,10 @@ __device__ __forceinline__ int64_t run_scene(Step& s, int64_t step) {
 
 // One thread block per scene, and one for particles outside. `shared` are the bytes of dynamic shared memory.
 template <class Source, class Task, class T, int D>
-__global__ void __launch_bounds__(kResidentThreads)
-    resident_kernel(const __grid_constant__ Source source, const __grid_constant__ Task task,
-                    const __grid_constant__ ResidentArguments<T, D> a, int shared) {
-  using S = ResidentShape<typename Source::Shape>;
+__global__ void __launch_bounds__(kMostSceneThreads)
+    block_per_scene_kernel(const __grid_constant__ Source source, const __grid_constant__ Task task,
+                           const __grid_constant__ BlockPerSceneArguments<T, D> a, int shared) {
+  using S = SceneShape<typename Source::Shape>;
   using Blocks = SceneBlocks<T, D>;
   using Rows = SharedParticles<S>;
   extern __shared__ __align__(16) char memory[];
@@ -578,7 +578,7 @@ __global__ void __launch_bounds__(kResidentThreads)
   __shared__ alignas(16) char update_memory[sizeof(GridUpdateArguments<T, D>)];
   __shared__ alignas(16) char contact_memory[sizeof(ContactArguments<T, D>)];
   const int scene = blockIdx.x;
-  if (scene == a.scenes) return leave_out_tail(source, task, a.steps);
+  if (scene == a.scenes) return skip_tail(source, task, a.steps);
   auto& update = *reinterpret_cast<GridUpdateArguments<T, D>*>(update_memory);
   auto& contact = *reinterpret_cast<ContactArguments<T, D>*>(contact_memory);
   const Topology<T, D>& t = source.topology;
@@ -640,34 +640,34 @@ __global__ void __launch_bounds__(kResidentThreads)
   move_clock(a, scene, a.steps - step);
 }
 
-// Where scenes are few, each has a multiprocessor of its own; else as many share one as there is room for.
+// Few scenes have a multiprocessor each; of many, as many as fit share one.
 template <class Source, class Task, class T, int D>
-void launch_resident(const Source& source, const Task& task, const ResidentArguments<T, D>& a, Stream stream) {
-  using S = ResidentShape<typename Source::Shape>;
-  static_assert(S::row_bytes + sizeof(int) <= kMostResidentRow &&
-                int64_t(SceneBlocks<T, D>::bytes) <= kMostResidentBlock);
+void launch_block_per_scene(const Source& source, const Task& task, const BlockPerSceneArguments<T, D>& a,
+                            Stream stream) {
+  using S = SceneShape<typename Source::Shape>;
+  static_assert(S::row_bytes + sizeof(int) <= kMostSceneRow && int64_t(SceneBlocks<T, D>::bytes) <= kMostSceneBlock);
   if (source.topology.particles == 0 || a.scenes == 0) return;
   const int most = device_attribute(cudaDevAttrMaxSharedMemoryPerBlockOptin) - 4096;
   const int all = device_attribute(cudaDevAttrMaxSharedMemoryPerMultiprocessor);
   const int processors = device_attribute(cudaDevAttrMultiProcessorCount);
   const int64_t particles = (source.topology.particles + a.scenes - 1) / a.scenes;
-  // A pool that has grown has a half more than was wanted.
+  // A pool that has grown has half as many blocks more than were needed.
   const int64_t blocks = std::min<int64_t>(a.update.geometry.blocks_per_scene,
                                            3 * int64_t(source.topology.max_blocks) / (4 * a.scenes) + 2);
-  const int64_t wanted = bytes_of_table(a.update.geometry.blocks_per_scene) +
-                         bytes_of_particles<S>(particles + particles / 16) +
-                         blocks * int64_t(SceneBlocks<T, D>::bytes) + 5 * 1024;  // and what the kernel declares itself
-  // The order of sums depends on the number of threads, so that of deterministic scenes is always the same.
+  const int64_t wanted =
+      bytes_of_table(a.update.geometry.blocks_per_scene) + bytes_of_particles<S>(particles + particles / 16) +
+      blocks * int64_t(SceneBlocks<T, D>::bytes) + 5 * 1024;  // and the static shared memory of the kernel
+  // The order of sums depends on the number of threads, which is fixed for deterministic scenes.
   const bool in_order = a.p2g.deterministic;
   const int64_t beside = std::min<int64_t>({all / wanted, (a.scenes + processors - 1) / processors, in_order ? 1 : 4});
   const int together = int(std::max<int64_t>(beside, 1));
   const int shared = std::min(most, all / together - 5 * 1024);
   // Alone on its multiprocessor, a scene of a few particles is faster with all threads, for the nodes.
-  const int64_t useful = together == 1 ? kResidentThreads : std::max<int64_t>(128, (particles + 31) / 32 * 32);
+  const int64_t useful = together == 1 ? kMostSceneThreads : std::max<int64_t>(128, (particles + 31) / 32 * 32);
   const int threads =
-      in_order ? kResidentThreads : int(std::min<int64_t>(kResidentThreads / together / 32 * 32, useful));
-  launch(resident_kernel<Source, Task, T, D>, unsigned(a.scenes + 1), unsigned(threads), size_t(shared), stream, source,
-         task, a, shared);
+      in_order ? kMostSceneThreads : int(std::min<int64_t>(kMostSceneThreads / together / 32 * 32, useful));
+  launch(block_per_scene_kernel<Source, Task, T, D>, unsigned(a.scenes + 1), unsigned(threads), size_t(shared), stream,
+         source, task, a, shared);
 }
 
 }  // namespace mpm::cuda

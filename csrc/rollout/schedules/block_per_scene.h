@@ -10,10 +10,10 @@
 namespace mpm {
 
 // Largest sizes in bytes, for float: of a particle, and of a block with its cells.
-constexpr int64_t kMostResidentRow = 96, kMostResidentBlock = 1600;
+constexpr int64_t kMostSceneRow = 96, kMostSceneBlock = 1600;
 
 // Errors of a scene, and their first substeps; zeroed before a call.
-struct SceneTrouble {
+struct SceneErrors {
   int step;  // 1 + the substep of the first error, or 0
   int outside, first_outside, not_finite, first_not_finite;
   int full, wanted;  // 1 + the first substep without room for its blocks, or 0; number of missing blocks
@@ -22,7 +22,7 @@ struct SceneTrouble {
 // The fields of the particles are those of `p2g` and `advance`, updated in place. The activation is that of the first
 // substep.
 template <class T, int D>
-struct ResidentArguments {
+struct BlockPerSceneArguments {
   P2GArguments<T, D> p2g;
   G2PAdvanceArguments<T, D> advance;
   GridUpdateArguments<T, D> update;
@@ -36,15 +36,15 @@ struct ResidentArguments {
   char* rows = nullptr;          // for scenes that exceed shared memory
   char* blocks = nullptr;        // [spare_blocks], for scenes that grow beyond it
   int spare_blocks = 0;
-  int* blocks_taken = nullptr;      // number used, zero before the call
-  SceneTrouble* trouble = nullptr;  // [scenes]
+  int* blocks_taken = nullptr;    // number used, zero before the call
+  SceneErrors* errors = nullptr;  // [scenes]
 };
 
 // Writes the errors of the scenes to the status of the activation.
 struct BlockPerSceneStatusArguments {
   int scenes = 1, max_blocks = 0;
   int64_t steps = 0;
-  const SceneTrouble* trouble = nullptr;
+  const SceneErrors* errors = nullptr;
   const int* activated = nullptr;  // [1 + scenes, 8] after the activation
   int* status = nullptr;
   const int64_t* id = nullptr;  // [P] or null

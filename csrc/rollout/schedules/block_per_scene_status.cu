@@ -10,7 +10,7 @@ namespace {
 
 constexpr int kThreads = 256;
 
-__device__ void write_errors(const BlockPerSceneStatusArguments& a, const SceneTrouble& t, int row, int before) {
+__device__ void write_errors(const BlockPerSceneStatusArguments& a, const SceneErrors& t, int row, int before) {
   int* const status = a.status + row * int64_t(kStatusSize);
   status[kProblemActivation] = before + t.step - 1;
   const auto write = [&](int particles, int p, int count, int first, int id) {
@@ -24,10 +24,10 @@ __device__ void write_errors(const BlockPerSceneStatusArguments& a, const SceneT
 }
 
 // By one thread: row 0 reports the first activation with an error in any scene.
-__device__ void tell_of_all(const BlockPerSceneStatusArguments& a, int before) {
-  SceneTrouble all{INT_MAX, 0, INT_MAX, 0, INT_MAX, INT_MAX, 0};
+__device__ void write_all_errors(const BlockPerSceneStatusArguments& a, int before) {
+  SceneErrors all{INT_MAX, 0, INT_MAX, 0, INT_MAX, INT_MAX, 0};
   for (int b = 0; b < a.scenes; b++) {
-    const SceneTrouble& t = a.trouble[b];
+    const SceneErrors& t = a.errors[b];
     all.wanted += t.wanted;
     if (t.full > 0) all.full = ::min(all.full, t.full);
     if (t.step == 0 || t.step > all.step) continue;
@@ -49,13 +49,13 @@ __global__ void __launch_bounds__(kThreads) block_per_scene_status_kernel(const 
     const int64_t start = row * kStatusSize;
     copy_status(a.activated + start, a.status + start);
     if (row == 0) continue;
-    const SceneTrouble& t = a.trouble[row - 1];
+    const SceneErrors& t = a.errors[row - 1];
     if (t.step > 0 && a.status[start + kProblemActivation] < 0) write_errors(a, t, int(row), before);
   }
   __syncthreads();
   if (threadIdx.x > 0) return;
   a.status[kActivations] += int(a.steps) - 1;
-  tell_of_all(a, before);
+  write_all_errors(a, before);
 }
 
 }  // namespace

@@ -20,7 +20,7 @@ struct WideTile {
   static constexpr int width = kBlockWidth + Order + 2 * kHalo, row = width + 2, plane = width * row + 4;
   static constexpr int nodes = D == 2 ? width * width : width * width * width, room = D == 2 ? plane : width * plane;
   static constexpr int blocks = 1;
-  using Node = Quad<T>;  // mass and velocity, as in the grid in 3-D
+  using Node = Vec4<T>;  // mass and velocity, as in the grid in 3-D
   const Node* corner;    // the base node
   BlockRows<1> rows;
 
@@ -53,8 +53,8 @@ struct G2P2GMemory {
   int number;  // of the item after the next
   ItemPlace<T, D> places[2];
   int head[S::lists + 1];
-  Strays<S::batch> far;                    // particles beyond the blocks around, after G2P
-  int strays;                              // number of particles in the blocks around:
+  OutOfBlockList<S::batch> far;            // particles beyond the blocks around, after G2P
+  int out_of_block;                        // number of particles in the blocks around:
   uint16_t row[S::batch], base[S::batch];  // their contributions; their base nodes, from the first block around
   T x[D][S::batch];
   alignas(16) typename Tile::Node tile[Tile::room];
@@ -110,15 +110,17 @@ class G2P2G {
       next = m.number;
       if (next < count) load_item(schedule, next);
       if (Fixed) __syncthreads();
-      add_particles(nodes(), shared, here().following, false, [&] { add_all_strays(); }, [&] { empty(); });
+      add_particles(nodes(), shared, here().following, false, [&] { add_all_out_of_block(); }, [&] { empty(); });
       turn_ = 1 - turn_;
     }
   }
 
   // Skipped particles are at rest.
-  __device__ void leave_out(int p) const { source.leave_out_at_rest(p); }
+  __device__ void skip(int p) const { source.skip_at_rest(p); }
 
-  __device__ void tell(Drift* drift) const { add_to_drift(drift, strays_, lost_); }
+  __device__ void flush_counters(Displacement* displacement) const {
+    add_to_displacement(displacement, out_of_block_, lost_);
+  }
 
  private:
   const Source& source;
@@ -129,7 +131,7 @@ class G2P2G {
   int* const taken_;
   const T dt_;
   const typename Source::Parameters parameters_;  // of all particles
-  int strays_ = 0, lost_ = 0, turn_ = 0;
+  int out_of_block_ = 0, lost_ = 0, turn_ = 0;
 
   __device__ const Topology<T, D>& topology() const { return source.topology; }
 
@@ -139,7 +141,7 @@ class G2P2G {
 
   __device__ void empty() {
     empty_lists<S>(m.head);
-    if (threadIdx.x == 0) m.far.count = m.strays = 0;
+    if (threadIdx.x == 0) m.far.count = m.out_of_block = 0;
   }
 
   __device__ void load_item(const Schedule<const int>& schedule, int i) {
@@ -166,7 +168,7 @@ class G2P2G {
       }
       const int slot = inside ? topology().table[item.block + way] : -1;
       place.slots[thread] = slot;
-      if (inside && slot < 0) lost_ |= Drift::kLost;
+      if (inside && slot < 0) lost_ |= Displacement::kLost;
     } else if (thread >= 32 && thread < 32 + (1 << D)) {
       place.following[thread - 32] = schedule_of(topology()).neighbours[(item.slot << D) + thread - 32];
     } else if (thread == 62) {
@@ -202,7 +204,7 @@ class G2P2G {
       const int64_t row = int64_t(slot < 0 ? 0 : slot) * kBlockNodes<D> + node_in_block<D>(node);
       const T* const velocity = task.nodes.pointer + row * (1 + D);
       if constexpr (D == 3) {
-        __pipeline_memcpy_async(m.tile + to, velocity - 1, sizeof(Quad<T>), slot < 0 ? sizeof(Quad<T>) : 0);
+        __pipeline_memcpy_async(m.tile + to, velocity - 1, sizeof(Vec4<T>), slot < 0 ? sizeof(Vec4<T>) : 0);
       } else {
 #pragma unroll
         for (int c = 0; c < D; c++)
@@ -265,12 +267,12 @@ class G2P2G {
     store_particle<S, T, D>(shared, row, f, source.contribution(particle));
     const int list = list_of<S>(k, at_home, cell);
     shared.next[row] = uint16_t(Fixed ? list : atomicExch(&shared.head[list], row));
-    if (!at_home) stray(k, row, to);
+    if (!at_home) put_out_of_block(k, row, to);
   }
 
   // A particle out of its block. It may move less than a cell before it is inspected again.
-  __device__ void stray(int k, int row, const Vector<T, D>& x) {
-    strays_++;
+  __device__ void put_out_of_block(int k, int row, const Vector<T, D>& x) {
+    out_of_block_++;
     const Geometry<T, D>& g = topology().geometry;
     bool near = true, around = true, inside = true;
     int base = 0;
@@ -282,11 +284,11 @@ class G2P2G {
       inside = inside && on_lattice<Order>(g, i, node);
       base = base * 3 * kBlockWidth + int(from);
     }
-    if (!near) lost_ |= Drift::kLost;
+    if (!near) lost_ |= Displacement::kLost;
     if (!inside) {
-      lost_ |= Drift::kLost | Drift::kMissed;
+      lost_ |= Displacement::kLost | Displacement::kMissed;
     } else if (around) {
-      const int s = atomicAdd(&m.strays, 1);
+      const int s = atomicAdd(&m.out_of_block, 1);
       m.row[s] = uint16_t(row);
       m.base[s] = uint16_t(base);
     } else {
@@ -295,10 +297,10 @@ class G2P2G {
   }
 
   // A warp adds one at a time.
-  __device__ void add_all_strays() const {
-    for (int s = threadIdx.x / 32; s < m.strays; s += threads / 32) {
+  __device__ void add_all_out_of_block() const {
+    for (int s = threadIdx.x / 32; s < m.out_of_block; s += threads / 32) {
       const int base = m.base[s];
-      add_stray<S>(nodes(), shared, m.row[s], [&](const int (&offset)[D]) -> int64_t {
+      add_one_out_of_block<S>(nodes(), shared, m.row[s], [&](const int (&offset)[D]) -> int64_t {
         int node[D], block = 0;
 #pragma unroll
         for (int i = D - 1, rest = base, step = 1; i >= 0; i--, rest /= 3 * kBlockWidth, step *= 3) {
@@ -310,7 +312,8 @@ class G2P2G {
         return slot < 0 ? -1 : int64_t(slot) * kBlockNodes<D> + node_in_block<D>(node);
       });
     }
-    add_strays<S>(source, nodes(), topology(), schedule_of(topology()), here().home.scene, shared, m.far, here().begin);
+    add_out_of_block<S>(source, nodes(), topology(), schedule_of(topology()), here().home.scene, shared, m.far,
+                        here().begin);
   }
 };
 
@@ -321,7 +324,7 @@ template <bool Fixed, class Source, class Task, class T, int D>
 __global__ void __launch_bounds__(Source::Shape::threads, kG2P2GBlocks)
     g2p2g_kernel(const __grid_constant__ Source source, const __grid_constant__ Task task, const OwnRows own,
                  const int* copy, int* taken) {
-  wait_for_kernel_before();
+  grid_dependency_sync();
   const Topology<T, D>& t = source.topology;
   if (own.is_due(t.particles)) return;  // a new activation follows between G2P and P2G
   extern __shared__ __align__(16) char memory[];
@@ -332,8 +335,8 @@ __global__ void __launch_bounds__(Source::Shape::threads, kG2P2GBlocks)
   const int64_t stride = int64_t(gridDim.x) * blockDim.x;
   for (int64_t i = t.offsets[t.max_blocks] + int64_t(blockIdx.x) * blockDim.x + threadIdx.x; i < t.particles;
        i += stride)
-    g2p2g.leave_out(t.index[i]);
-  g2p2g.tell(task.drift);
+    g2p2g.skip(t.index[i]);
+  g2p2g.flush_counters(task.displacement);
 }
 
 template <class Source, class Task, class T, int D>

@@ -14,7 +14,7 @@ template <class T, int D>
 struct G2P2GArguments {
   P2GArguments<T, D> p2g;
   LateDeformation<T, D> late;
-  G2PAdvanceArguments<T, D> advance;  // its drift counts the displaced particles
+  G2PAdvanceArguments<T, D> advance;  // with the counters of displaced particles
   OwnRows own;
   const int* copy = nullptr;   // number of the copy with the particles
   int* items_taken = nullptr;  // items after the first one of each thread block, zeroed before

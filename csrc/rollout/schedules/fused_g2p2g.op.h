@@ -31,8 +31,10 @@ class FusedG2P2G {
   Particles<T> own_;
 
   int* status(int64_t step) { return status_[(s_.in.n - 1 - step) % 2]; }  // that of the last step is status_[0]
-  Drift* drift(int64_t step) { return static_cast<Drift*>(s_.drifts.data_ptr()) + step % 2; }
-  Drift* nowhere() { return static_cast<Drift*>(nowhere_.data_ptr()); }
+  Displacement* displacement(int64_t step) {
+    return static_cast<Displacement*>(s_.displacements.data_ptr()) + step % 2;
+  }
+  Displacement* nowhere() { return static_cast<Displacement*>(nowhere_.data_ptr()); }
   auto& kernels() { return s_.calls[0].law->template kernels<T, D>(); }
 
   void begin(const Particles<const T>& given, const int* before);
@@ -61,7 +63,7 @@ FusedG2P2G<T, D>::FusedG2P2G(Substeps<T, D>& s, const Particles<T>& results, Ten
   origin_ = empty_int(in.x, {both});
   copy_ = empty_int(in.x, {1});
   items_taken_ = empty_int(in.x, {1});
-  nowhere_ = empty_int(in.x, {int64_t(sizeof(Drift) / sizeof(int))});
+  nowhere_ = empty_int(in.x, {int64_t(sizeof(Displacement) / sizeof(int))});
   torch::stable::zero_(copy_);
   torch::stable::zero_(nowhere_);
   own_ = {field<T>(x_), results.v, results.C, field<T>(F_), field<T>(J_), field<T>(residual_), field<T>(history_)};
@@ -89,21 +91,21 @@ void FusedG2P2G<T, D>::begin(const Particles<const T>& given, const int* before)
   s_.read(given, own_.F);
   s_.write(own_);
   s_.move_late(own_, false, false);
-  Settling<T, D>& settling = s_.settling;
-  settling.rows = rows_;
-  settling.given = true;
-  settling.x = own_.x;
-  settling.mass = field<T>(mass_);
-  settling.volume = field<T>(volume_);
-  settling.residual = own_.residual;
-  settling.residual_before = given.residual;
-  settling.origin = static_cast<int*>(origin_.data_ptr());
-  settling.copy = static_cast<int*>(copy_.data_ptr());
-  settling.index = s_.activation.index;
-  s_.activation.drift = nullptr;
-  s_.activation.next_drift = drift(0);
+  ReorderOnScatter<T, D>& reorder = s_.reorder;
+  reorder.rows = rows_;
+  reorder.given = true;
+  reorder.x = own_.x;
+  reorder.mass = field<T>(mass_);
+  reorder.volume = field<T>(volume_);
+  reorder.residual = own_.residual;
+  reorder.residual_before = given.residual;
+  reorder.origin = static_cast<int*>(origin_.data_ptr());
+  reorder.copy = static_cast<int*>(copy_.data_ptr());
+  reorder.index = s_.activation.index;
+  s_.activation.displacement = nullptr;
+  s_.activation.next_displacement = displacement(0);
   s_.activate(before, status(0), stream_);
-  kernels().p2g(s_.laws[0], s_.late, s_.p2g, settling, stream_);
+  kernels().p2g(s_.laws[0], s_.late, s_.p2g, reorder, stream_);
   update_grid(0, stream_);
 }
 
@@ -115,15 +117,15 @@ void FusedG2P2G<T, D>::use_own() {
   s_.move_late(own_, true, false);
   s_.p2g.mass = field<const T>(mass_);
   s_.p2g.volume = field<const T>(volume_);
-  s_.settling.given = false;
-  s_.settling.residual_before = own.residual;
+  s_.reorder.given = false;
+  s_.reorder.residual_before = own.residual;
   ActivateArguments<T, D>& activation = s_.activation;
-  activation.origin = s_.settling.origin;
-  activation.copy = s_.settling.copy;
+  activation.origin = s_.reorder.origin;
+  activation.copy = s_.reorder.copy;
   activation.copy_rows = rows_;
-  GivingBack<T>& restore = s_.advance.own;
+  RestoreOrder<T>& restore = s_.advance.own;
   restore.rows = rows_;
-  restore.origin = s_.settling.origin;
+  restore.origin = s_.reorder.origin;
   restore.columns = int(s_.columns);
   restore.history = own.history;
   restore.history_next = results_.history;
@@ -133,17 +135,17 @@ void FusedG2P2G<T, D>::use_own() {
 // blocks at the end.
 template <class T, int D>
 void FusedG2P2G<T, D>::run_substep(int64_t step, bool ends, backend::Stream stream) {
-  const Drift* const before = drift(step - 1);
-  s_.advance.own.drift = s_.settling.drift = s_.activation.drift = ends ? nullptr : before;
+  const Displacement* const before = displacement(step - 1);
+  s_.advance.own.displacement = s_.reorder.displacement = s_.activation.displacement = ends ? nullptr : before;
   s_.activation.missed = before;
-  s_.activation.next_drift = drift(step);
-  s_.advance.drift = nowhere();
+  s_.activation.next_displacement = displacement(step);
+  s_.advance.displacement = nowhere();
   backend::g2p_advance(s_.in.lattice.order(), s_.advance, stream);
   s_.activate(status(step - 1), status(step), stream);
-  kernels().p2g(s_.laws[0], s_.late, s_.p2g, s_.settling, stream);
+  kernels().p2g(s_.laws[0], s_.late, s_.p2g, s_.reorder, stream);
   if (!ends) {
-    G2P2GArguments<T, D> a{s_.p2g, s_.late, s_.advance, s_.settling, s_.settling.copy, s_.next.items_taken};
-    a.advance.drift = drift(step);
+    G2P2GArguments<T, D> a{s_.p2g, s_.late, s_.advance, s_.reorder, s_.reorder.copy, s_.next.items_taken};
+    a.advance.displacement = displacement(step);
     kernels().g2p2g(s_.laws[0], a, stream);
   }
   update_grid(step, stream);
@@ -151,8 +153,8 @@ void FusedG2P2G<T, D>::run_substep(int64_t step, bool ends, backend::Stream stre
 
 template <class T, int D>
 void FusedG2P2G<T, D>::update_grid(int64_t step, backend::Stream stream) {
-  s_.next.drift = s_.next.watched = drift(step);
-  s_.next.next_drift = drift(step + 1);
+  s_.next.displacement = s_.next.watched = displacement(step);
+  s_.next.next_displacement = displacement(step + 1);
   s_.next.items_taken = static_cast<int*>(items_taken_.data_ptr());
   s_.move_nodes(stream);
   s_.end_time(stream);
@@ -163,8 +165,8 @@ template <class T, int D>
 void FusedG2P2G<T, D>::end() {
   G2PAdvanceArguments<T, D> a = s_.advance;
   a.late = false;
-  a.own.drift = nullptr;
-  a.drift = nowhere();
+  a.own.displacement = nullptr;
+  a.displacement = nowhere();
   a.x_next = results_.x;
   a.residual_next = results_.residual;
   a.F = constant(own_.F);

@@ -75,7 +75,7 @@ class ChunkPass {
     lay_out<D>(written_, a.to_nodes.schedule, t_.max_blocks, t_.particles);
   }
   ~ChunkPass() {
-    if (a_.follows) __atomic_fetch_add(&a_.to_nodes.whereabouts->strays, strays_, __ATOMIC_RELAXED);
+    if (a_.follows) __atomic_fetch_add(&a_.to_nodes.whereabouts->out_of_block, out_of_block_, __ATOMIC_RELAXED);
   }
 
   // `my_turn` waits for the sums of earlier colours.
@@ -94,7 +94,8 @@ class ChunkPass {
       order_ = written_.order + begin_;
       cell_end_ = written_.cell_end + c * kBlockNodes<D>;
       gather(base_block, next);
-      for (int k = cell_end_[kBlockNodes<D> - 1]; k < count_; k++) gather_stray(base_block.scene, order_[k] % kChunk);
+      for (int k = cell_end_[kBlockNodes<D> - 1]; k < count_; k++)
+        gather_out_of_block(base_block.scene, order_[k] % kChunk);
       advance(base_block.scene);
       if (!a_.follows) continue;
       give(base_block);
@@ -102,7 +103,7 @@ class ChunkPass {
       sum_cells(contributions_, order_, cell_end_, momenta_);
       for (int k = cell_end_[kBlockNodes<D> - 1]; k < count_; k++) {
         my_turn();
-        add_stray(base_block, order_[k]);
+        add_one_out_of_block(base_block, order_[k]);
       }
     }
     if (!a_.follows) return;
@@ -187,7 +188,7 @@ class ChunkPass {
     for (int k = 0; k < a_.to_nodes.prefetched_count; k++) __builtin_prefetch(a_.to_nodes.prefetched[k] + p, 0, 2);
   }
 
-  void gather_stray(int scene, int i) {
+  void gather_out_of_block(int scene, int i) {
     int base[D];
     T f[D];
     for (int a = 0; a < D; a++) {
@@ -209,12 +210,12 @@ class ChunkPass {
   }
 
   // By the cell of `find_cells`: its weights belong to these nodes, independent of rounding elsewhere.
-  void add_stray(const BaseBlock<T, D>& base_block, int i) {
+  void add_one_out_of_block(const BaseBlock<T, D>& base_block, int i) {
     int base[D];
     for (int a = D - 1, near = near_[i]; a >= 0; a--, near /= kNear) base[a] = base_block.corner[a] + near % kNear - 1;
     const NodesOf<kOrder, T, D> nodes(t_, base_block.scene, base);
     add_to_own_nodes(contributions_, i, a_.sums, nodes);
-    strays_++;
+    out_of_block_++;
   }
 
   // The end of the step: x, F and J.
@@ -266,7 +267,7 @@ class ChunkPass {
   const AdvancedRows<T, D> rows_;
   const FieldRows<const T, 1> mass_, volume_;
   DisplacementBudget<T, D> displacement_budget_;
-  int strays_ = 0, begin_ = 0, count_ = 0;
+  int out_of_block_ = 0, begin_ = 0, count_ = 0;
   ScheduleOut written_;  // its orders and cells, chunk by chunk
   uint16_t *order_ = nullptr, *cell_end_ = nullptr;
   // For each particle of the chunk: its cell in the base block, kBlockNodes if it is in another block; and its cell
@@ -307,7 +308,7 @@ void g2p2g_chunks(const G2P2GChunksArguments<T, D>& a) {
     g2p2g_with<false>(a);
   const Topology<T, D>& t = a.advance.gather.topology;
   const int first = t.offsets[t.max_blocks];
-  if (!a.follows || a.fresh) leave_outside(a.advance);
+  if (!a.follows || a.fresh) skip_outside(a.advance);
   if (a.follows && first < t.particles) laws_outside(a.to_nodes, first);
 }
 

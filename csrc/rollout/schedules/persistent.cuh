@@ -10,11 +10,11 @@
 // The kernel of substeps that last in their activation. A substep is
 //   P2G     of each item by a thread block; then a barrier
 //   G2P     of the same item, with the grid update and contact of each node of its tile.
-// Whether the activation still lasts all know after the barrier of the next P2G, which is given up if it does not: what
-// the law changes is kept only then. Where thread blocks have several items, or scenes clocks of their own, there is
+// The barrier of the next P2G shows whether the activation still lasts. If not, that P2G is dropped; the changes by the
+// law are stored only afterwards. Where thread blocks have several items, or scenes clocks of their own, there is
 // a second barrier.
-// A substep of few particles is one chain of loads and sums that wait for each other. So what an item needs of the grid
-// is loaded once where a thread block has no other item, and cells have more threads in 3-D than in P2G alone.
+// A substep of few particles is one chain of loads and sums that wait for each other. So the grid data
+// of an item are loaded once if a thread block has no other item, and cells have more threads in 3-D than in P2G alone.
 #if CUDART_VERSION >= 13000
 namespace mpm::cuda {
 
@@ -40,7 +40,7 @@ struct NodeVelocities {
 template <class S>
 using SharingShape = ScatterShape<S::Order, typename S::T, S::D, S::Plain, S::Linear, S::Gradient, S::D == 2 ? 4 : 2>;
 
-// What the threads of an item share beside its particles, sums and nodes.
+// Values shared by the threads of an item, beside its particles, sums and nodes.
 template <class S>
 struct ItemMemory {
   static constexpr int D = S::D, most = S::threads;
@@ -49,8 +49,8 @@ struct ItemMemory {
   SlotUpdate<T, D> there[1 << D];
   BaseBlock<T, D> home;
   int head[S::lists + 1];
-  int strays;                 // particles that are not in the block of the item:
-  int row[most], base[most];  // of what they give, and of their base nodes, -1 where there is none
+  int out_of_block;           // particles out of the block of the item:
+  int row[most], base[most];  // rows of their contributions, and their base nodes, -1 without one
 };
 
 // The phases of a substep of one item, whose particles have a thread each.
@@ -61,11 +61,12 @@ class ItemStep {
   using T = typename S::T;
   static constexpr int D = S::D, Order = Task::Order, width = kBlockWidth + Order, threads = S::threads;
   static constexpr int tile_nodes = D == 2 ? width * width : width * width * width;
-  // The support of a stray has rows as those of the tile, so that both are one for G2P.
+  // The support of a particle out of block has the row length of the tile, so that G2P treats both alike.
   static constexpr int support_nodes = S::support * S::slab,
                        span = (D == 2 ? 0 : Order * width * width) + Order * width + Order + 1;
-  static constexpr int strays_at_once = (int(S::shared_bytes / sizeof(NodeValue<T, D>)) - tile_nodes) / span;
-  static_assert(threads >= persistent_item<D>(kMostPersistentParticles) && S::batch >= threads && strays_at_once > 0);
+  static constexpr int out_of_block_at_once = (int(S::shared_bytes / sizeof(NodeValue<T, D>)) - tile_nodes) / span;
+  static_assert(threads >= persistent_item<D>(kMostPersistentParticles) && S::batch >= threads &&
+                out_of_block_at_once > 0);
 
   const Source& source;
   const Task& task;
@@ -77,7 +78,7 @@ class ItemStep {
                       ItemMemory<S>& memory_of_item, char* memory)
       : source(source), task(task), update(update), m(memory_of_item), memory(memory) {}
 
-  // By all threads, which are done with the item before.
+  // By all threads, after they have finished the previous item.
   __device__ void begin(int number) {
     const Schedule<const int> schedule = schedule_of(topology());
     const int4 e = reinterpret_cast<const int4*>(schedule.items)[number];
@@ -90,7 +91,7 @@ class ItemStep {
       if (slot >= 0) m.there[threadIdx.x] = slot_update(update, slot);
     }
     if (threadIdx.x == 32) m.home.template set<Order>(topology(), e.w);
-    if (threadIdx.x == 64) m.strays = 0;
+    if (threadIdx.x == 64) m.out_of_block = 0;
     empty_lists<S>(m.head);
     if (exists_) x_ = read_vector(source.position, particle_);
     __syncthreads();
@@ -99,7 +100,7 @@ class ItemStep {
     for (int o = 0; o < 1 << D; o++) active_ |= unsigned(m.slots[o] >= 0) << o;
   }
 
-  // What link() needs of the particles, which stays in registers while they have a thread each.
+  // Loads the inputs of link(), which stay in registers if each particle has a thread.
   __device__ void load() {
     if (!exists_) return;
     state_ = source.read(particle_, m.home.scene, particle_);
@@ -107,7 +108,8 @@ class ItemStep {
     source.fetch(particle_, changes_);
   }
 
-  // What the particles give, in shared memory. What their law changes is not kept yet, so that it may be given up.
+  // Stores the contributions of the particles in shared memory. The changes by the law are not stored yet, since the
+  // P2G may be dropped.
   __device__ void link() {
     const SharedParticles<S> shared(memory, m.head);
     if (exists_) {
@@ -116,7 +118,7 @@ class ItemStep {
       find();
       const int row = SharedParticles<S>::row(threadIdx.x);
       store_particle<S, T, D>(shared, row, f_, source.contribution(loaded));
-      const int list = list_of<S>(threadIdx.x, stray_ < 0, cell_);
+      const int list = list_of<S>(threadIdx.x, out_of_block_ < 0, cell_);
       shared.next[row] = uint16_t(in_order() ? list : atomicExch(&m.head[list], row));
     }
     __syncthreads();
@@ -129,33 +131,34 @@ class ItemStep {
     if (exists_) source.keep(particle_, changes_);
   }
 
-  // Of linked particles.
+  // P2G of linked particles.
   __device__ void scatter(T* nodes) {
     const SharedParticles<S> shared(memory, m.head);
     const NodeSums<T> field{{nodes, 1 + D, 1 + D}, source.nodes.fixed};
-    add_particles(field, shared, m.slots, false, [&] { add_strays(field, shared); });
+    add_particles(field, shared, m.slots, false, [&] { add_out_of_block(field, shared); });
     empty_lists<S>(m.head);
   }
 
-  // G2P of the particles that link() has found, or that it finds itself.
+  // G2P of the particles; `found` if link() has located them.
   __device__ void gather(const NodeVelocities<T, D>& velocities, bool found, FollowerOf<Task>& follower) {
     NodeValue<T, D>* const tile = reinterpret_cast<NodeValue<T, D>*>(memory);
     if (!found) {
       if (exists_) find();
       __syncthreads();
     }
-    const int strays = m.strays;
+    const int out_of_block = m.out_of_block;
     int first = 0;
     do {
-      const int count = ::min(strays - first, strays_at_once);
+      const int count = ::min(out_of_block - first, out_of_block_at_once);
       load_velocities(velocities, tile, first, first == 0 ? tile_nodes : 0, count);
       __syncthreads();
-      const bool mine = stray_ < 0 ? first == 0 : stray_ >= first && stray_ < first + count;
-      if (exists_ && mine) move(stray_ < 0 ? tile + corner() : tile + tile_nodes + (stray_ - first) * span, follower);
-      first += strays_at_once;
+      const bool mine = out_of_block_ < 0 ? first == 0 : out_of_block_ >= first && out_of_block_ < first + count;
+      if (exists_ && mine)
+        move(out_of_block_ < 0 ? tile + corner() : tile + tile_nodes + (out_of_block_ - first) * span, follower);
+      first += out_of_block_at_once;
       __syncthreads();
-    } while (first < strays);
-    if (threadIdx.x == 0) m.strays = 0;
+    } while (first < out_of_block);
+    if (threadIdx.x == 0) m.out_of_block = 0;
     __syncthreads();
   }
 
@@ -164,21 +167,21 @@ class ItemStep {
 
   __device__ bool in_order() const { return is_fixed(source.nodes); }
 
-  // Where the particle is.
+  // Locates the particle.
   __device__ void find() {
-    stray_ = -1;
+    out_of_block_ = -1;
     if (m.home.template locate<Order>(topology().geometry, x_, cell_, f_)) return;
     int base[D];
     const int slot = locate_slot<Order>(topology(), m.home.scene, x_, base, f_);
-    stray_ = atomicAdd(&m.strays, 1);
-    m.row[stray_] = SharedParticles<S>::row(threadIdx.x);
-    m.base[stray_] = slot < 0 ? -1 : slot * kBlockNodes<D> + node_in_block<D>(base);
+    out_of_block_ = atomicAdd(&m.out_of_block, 1);
+    m.row[out_of_block_] = SharedParticles<S>::row(threadIdx.x);
+    m.base[out_of_block_] = slot < 0 ? -1 : slot * kBlockNodes<D> + node_in_block<D>(base);
   }
 
-  // A warp takes one at a time.
-  __device__ void add_strays(const NodeSums<T>& nodes, const SharedParticles<S>& shared) const {
-    for (int s = threadIdx.x / 32; s < m.strays; s += threads / 32)
-      if (m.base[s] >= 0) add_stray(nodes, schedule_of(topology()), shared, m.row[s], m.base[s]);
+  // A warp adds one at a time.
+  __device__ void add_out_of_block(const NodeSums<T>& nodes, const SharedParticles<S>& shared) const {
+    for (int s = threadIdx.x / 32; s < m.out_of_block; s += threads / 32)
+      if (m.base[s] >= 0) add_one_out_of_block(nodes, schedule_of(topology()), shared, m.row[s], m.base[s]);
   }
 
   template <int Width>
@@ -194,19 +197,19 @@ class ItemStep {
     return place;
   }
 
-  // Of the first nodes of the tile, and of the supports of `count` strays from one on.
-  __device__ void load_velocities(const NodeVelocities<T, D>& velocities, NodeValue<T, D>* tile, int first_stray,
+  // Computes the velocities of the first nodes of the tile, and of the supports of `count` particles out of block.
+  __device__ void load_velocities(const NodeVelocities<T, D>& velocities, NodeValue<T, D>* tile, int first_out_of_block,
                                   int of_tile, int count) const {
 #pragma unroll 1
     for (int i = threadIdx.x; i < of_tile + count * support_nodes; i += threads) {
       int offset[D], base = 0, place = i;
       const int* slots = m.slots;
-      const bool is_stray = i >= of_tile;
-      if (is_stray) {
+      const bool is_out_of_block = i >= of_tile;
+      if (is_out_of_block) {
         const int s = (i - of_tile) / support_nodes;
         split<Order + 1>((i - of_tile) % support_nodes, offset);
         place = tile_nodes + s * span + in_tile(offset);
-        base = m.base[first_stray + s];
+        base = m.base[first_out_of_block + s];
         slots = schedule_of(topology()).neighbours + (int64_t(base / kBlockNodes<D>) << D);
       } else {
         split<width>(i, offset);
@@ -215,13 +218,13 @@ class ItemStep {
       int node[D], neighbour = 0;
 #pragma unroll
       for (int axis = D - 1, rest = base; axis >= 0; axis--, rest /= kBlockWidth) {
-        node[axis] = (is_stray ? rest % kBlockWidth : 0) + offset[axis];
+        node[axis] = (is_out_of_block ? rest % kBlockWidth : 0) + offset[axis];
         neighbour |= (node[axis] >= kBlockWidth) << (D - 1 - axis);
       }
       const int slot = slots[neighbour];
       Vector<T, D> v = zero_vector<T, D>();
       if (slot >= 0) {
-        const SlotUpdate<T, D> there = is_stray ? slot_update(update, slot) : m.there[neighbour];
+        const SlotUpdate<T, D> there = is_out_of_block ? slot_update(update, slot) : m.there[neighbour];
         v = velocities.at(there, slot, node_in_block<D>(node));
       }
       NodeValue<T, D> value{};
@@ -238,8 +241,8 @@ class ItemStep {
   }
 
   __device__ void move(const NodeValue<T, D>* corner, FollowerOf<Task>& follower) {
-    if (stray_ >= 0 && m.base[stray_] < 0) {
-      task.leave_out(particle_);
+    if (out_of_block_ >= 0 && m.base[out_of_block_] < 0) {
+      task.skip(particle_);
       return source.fields.read_motion(particle_, state_);
     }
     const auto loaded = task.at(x_, m.home.scene);
@@ -257,13 +260,13 @@ class ItemStep {
   unsigned active_ = 0;  // bits of the neighbours of the block that are
   Vector<T, D> x_;
   T f_[D];
-  int cell_ = 0, stray_ = -1;
+  int cell_ = 0, out_of_block_ = -1;
   ParticleMomentum<T, D> state_;
   typename Source::Parameters parameters_;
   typename Source::Changes changes_;
 };
 
-// How many of the slots from `begin` to `end` are used, which come first.
+// Number of used slots from `begin` to `end`; these come first.
 template <class T, int D>
 __device__ int used_slots(const Topology<T, D>& t, int begin, int end) {
   const int first = begin;
@@ -301,55 +304,57 @@ __device__ void write_persistent_status(const PersistentLoop<T, D>& a, int scene
   }
 }
 
-// Barriers of the kernel, and what thread blocks count of where particles go: in shared memory, from barrier to barrier
-// in turn, so that one can be read by the others of a cluster while they are at work on the next one.
+// Barriers of the kernel, with the displacement counters of thread blocks: in shared memory, with two counters in turn,
+// so that other blocks of a cluster can read one while the next one is in use.
 class CountingBarrier {
  public:
   static_assert(kLargestCluster <= 32);
 
-  __device__ CountingBarrier(unsigned long long* arrived, int blocks, bool cluster, Drift* counted)
+  __device__ CountingBarrier(unsigned long long* arrived, int blocks, bool cluster, Displacement* counted)
       : barrier_{arrived, unsigned(blocks)}, cluster_(cluster), counted_(counted) {
     if (threadIdx.x < 2) counted[threadIdx.x] = {};
   }
 
-  __device__ Drift* counted() { return counted_ + turn_; }
-  // Returns what all thread blocks have counted since the barrier before.
-  __device__ Drift wait() {
-    Drift* const mine = counted();
+  __device__ Displacement* counted() { return counted_ + turn_; }
+  // Returns the sum of the counters of all thread blocks since the previous barrier.
+  __device__ Displacement wait() {
+    Displacement* const mine = counted();
     turn_ = 1 - turn_;
-    const Drift all = cluster_ ? sum_of_cluster(mine) : sum_of_grid(*mine);
+    const Displacement all = cluster_ ? sum_of_cluster(mine) : sum_of_grid(*mine);
     if (threadIdx.x == 0) *counted() = {};
     return all;
   }
 
  private:
-  __device__ Drift sum_of_cluster(Drift* mine) {
-    __shared__ Drift all;
+  __device__ Displacement sum_of_cluster(Displacement* mine) {
+    __shared__ Displacement all;
     wait_for_cluster();
     if (threadIdx.x < 32) {
-      const Drift one = threadIdx.x < gridDim.x ? *in_block_of_cluster(mine, threadIdx.x) : Drift{};
-      const int strays = __reduce_add_sync(~0u, one.strays), lost = __reduce_or_sync(~0u, one.lost);
-      if (threadIdx.x == 0) all = {strays, lost};
+      const Displacement one = threadIdx.x < gridDim.x ? *in_block_of_cluster(mine, threadIdx.x) : Displacement{};
+      const int out_of_block = __reduce_add_sync(~0u, one.out_of_block), lost = __reduce_or_sync(~0u, one.lost);
+      if (threadIdx.x == 0) all = {out_of_block, lost};
     }
     __syncthreads();
     return all;
   }
-  __device__ Drift sum_of_grid(const Drift& mine) {
-    const unsigned sum = barrier_.wait([&] { return unsigned(mine.strays) + (mine.lost ? kLost : 0); });
-    const int strays = int(sum % kLost), before = strays_before_last_;  // of every other barrier
-    strays_before_last_ = strays_before_;
-    strays_before_ = strays;
-    return {strays - before, sum >= kLost};
+  __device__ Displacement sum_of_grid(const Displacement& mine) {
+    const unsigned sum = barrier_.wait([&] { return unsigned(mine.out_of_block) + (mine.lost ? kLost : 0); });
+    const int out_of_block = int(sum % kLost), before = out_of_block_before_last_;  // of every other barrier
+    out_of_block_before_last_ = out_of_block_before_;
+    out_of_block_before_ = out_of_block;
+    return {out_of_block - before, sum >= kLost};
   }
 
-  static constexpr unsigned kLost = 1 << 22;  // more than all strays of a launch; 1023 blocks may add as much
-  static_assert(int64_t(kStepsOfALaunch) * kMostPersistentParticles / kParticlesPerStray + kMostPersistentParticles <
+  static constexpr unsigned kLost =
+      1 << 22;  // more than all particles out of block of a launch; 1023 blocks may add as much
+  static_assert(int64_t(kStepsOfALaunch) * kMostPersistentParticles / kParticlesPerOutOfBlock +
+                    kMostPersistentParticles <
                 kLost);
 
   Barrier barrier_;
   const bool cluster_;
-  Drift* const counted_;
-  int turn_ = 0, strays_before_ = 0, strays_before_last_ = 0;
+  Displacement* const counted_;
+  int turn_ = 0, out_of_block_before_ = 0, out_of_block_before_last_ = 0;
 };
 
 template <class Source, class Task, class T, int D>
@@ -361,9 +366,9 @@ __global__ void __launch_bounds__(ItemStep<Source, Task>::threads, kItemsOfProce
   extern __shared__ __align__(16) char memory[];
   __shared__ ItemMemory<typename Step::S> shared;
   __shared__ int of_margin;
-  __shared__ Drift counted[2];
+  __shared__ Displacement counted[2];
   __shared__ alignas(16) char contact_memory[sizeof(ContactArguments<T, D>)];
-  wait_for_kernel_before();
+  grid_dependency_sync();
   const Topology<T, D>& t = source.topology;
   const bool cluster = is_cluster();
   const int items = *schedule_of(t).item_count, first = *a.steps_so_far;
@@ -388,10 +393,12 @@ __global__ void __launch_bounds__(ItemStep<Source, Task>::threads, kItemsOfProce
     }
   };
   const int64_t tail = t.offsets[t.max_blocks] + int64_t(blockIdx.x) * threads + threadIdx.x;
-  const auto each_outside = [&](const auto& leave_out) {
-    for (int64_t i = tail; i < t.particles; i += int64_t(blocks) * threads) leave_out(t.index[i]);
+  const auto each_outside = [&](const auto& skip) {
+    for (int64_t i = tail; i < t.particles; i += int64_t(blocks) * threads) skip(t.index[i]);
   };
-  const auto lasts = [&](const Drift& all) { return all.lost == 0 && all.strays * kParticlesPerStray <= t.particles; };
+  const auto lasts = [&](const Displacement& all) {
+    return all.lost == 0 && all.out_of_block * kParticlesPerOutOfBlock <= t.particles;
+  };
   const bool ahead = alone && !a.scene_time;
   int step = first;
   for (bool more = true; more;) {
@@ -405,7 +412,7 @@ __global__ void __launch_bounds__(ItemStep<Source, Task>::threads, kItemsOfProce
     if (!lasts(barrier.wait())) break;
 
     if (keeps) item.keep();
-    each_outside([&](int p) { source.leave_out(p); });
+    each_outside([&](int p) { source.skip(p); });
     const NodeVelocities<T, D> velocities{
         a.update,
         contact,
@@ -413,8 +420,8 @@ __global__ void __launch_bounds__(ItemStep<Source, Task>::threads, kItemsOfProce
         {reinterpret_cast<const NodeRow<T, D>*>(a.nodes[step % 3]), source.nodes.fixed}};
     FollowerOf<Task> follower;
     each_item([&] { item.gather(velocities, alone, follower); });
-    each_outside([&](int p) { task.leave_out(p); });
-    follower.tell(barrier.counted());
+    each_outside([&](int p) { task.skip(p); });
+    follower.flush_counters(barrier.counted());
     step++;
     more = step < a.steps && step - first < kStepsOfALaunch;
     if (keeps && more) item.link();  // of the next substep
@@ -425,10 +432,10 @@ __global__ void __launch_bounds__(ItemStep<Source, Task>::threads, kItemsOfProce
   }
   for (T* nodes : a.nodes) used.empty(nodes, source.nodes.fixed, blocks);
   if (blockIdx.x == 0) write_persistent_status(a, t.scenes, step - first);
-  if (cluster) wait_for_cluster();  // others may still read what this one has counted
+  if (cluster) wait_for_cluster();  // other blocks may still read the counters of this one
   if (!leads) return;
   *a.steps_so_far = step;
-  a.drift->lost = Drift::kLost;  // so that there is a new activation
+  a.displacement->lost = Displacement::kLost;  // requests a new activation
   if (a.loop) cudaGraphSetConditional(a.loop, step < a.steps);
 }
 

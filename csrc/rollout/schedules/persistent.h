@@ -11,7 +11,7 @@ namespace mpm {
 
 // Number of particles for each one out of its block from which a new activation, and a launch, pays: fewer of these are
 // processed by separate warps.
-constexpr int kParticlesPerStray = 32;
+constexpr int kParticlesPerOutOfBlock = 32;
 // Largest number of particles for a single cluster of thread blocks.
 constexpr int64_t kMostClusterParticles = 2048;
 constexpr int kStepsOfALaunch = 2048;  // at most
@@ -34,7 +34,7 @@ struct PersistentLoop {
   const T* scene_dt = nullptr;            // [scenes]
   int* steps_so_far = nullptr;            // zeroed before a call
   unsigned long long* arrived = nullptr;  // counters of barriers, two words zeroed before each launch
-  Drift* drift = nullptr;                 // requests a new activation
+  Displacement* displacement = nullptr;   // requests a new activation
   const int* activated = nullptr;         // status of the activation, [1 + scenes, 8]
   int* status = nullptr;                  // status of all substeps
   unsigned long long loop = 0;  // condition of the graph that repeats the kernel until all substeps are done, or zero

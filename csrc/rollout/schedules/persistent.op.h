@@ -34,10 +34,10 @@ bool run_persistent(Substeps<T, D>& s, int* activated, int* status, backend::Str
   backend::clear(steps_so_far, stream);
   a.steps_so_far = static_cast<int*>(steps_so_far.data_ptr());
   a.arrived = static_cast<unsigned long long*>(arrived.data_ptr());
-  a.drift = s.advance.drift;
+  a.displacement = s.advance.displacement;
   a.activated = activated;
   a.status = status;
-  s.activation.drift = a.drift;
+  s.activation.displacement = a.displacement;
   s.activation.previous_status = status;
   s.activation.status = activated;
   static std::atomic<int> works_on = -1;  // device on which such a graph has run

@@ -91,7 +91,7 @@ class SortedCpu {
   static constexpr int64_t kLeastLastingSteps = 8;
   static constexpr int64_t kLeastPasses = 2;  // further substeps needed for a pass
   // Cost of a particle out of its block, as a multiple of that of activating one particle.
-  static constexpr int kStraysOfRenewal = 10;
+  static constexpr int kCpuOutOfBlockCost = 10;
   static constexpr int kActivationsOfPatience = 16;  // after an activation that served a single substep
   static constexpr int kDeterministicSteps = 8;      // between two reorders on deterministic grids
 
@@ -145,7 +145,7 @@ class SortedCpu {
   bool reads_F_ = false, reads_J_ = false, viscous_ = false, rearranged_ = false;
   bool owned_ = false, moved_ = true;  // whether the fields are in buffers; whether some have moved since the last step
   int64_t breaks_ = 0, all_breaks_ = 0;  // of this substep, and since the last reorder
-  Drift drift_{};
+  Displacement displacement_{};
   Whereabouts whereabouts_{};
   double rounding_;                     // of positions [cells]
   int64_t passes_ = 0;                  // since the activation
@@ -260,14 +260,14 @@ bool SortedCpu<T, D>::begin(const int* status_before, int* status, int64_t follo
   s_.activation.scene_stride = scene_.now().stride[0];
   s_.activation.origin = origin_.now().pointer;
   tries_ = tries_to_last(following);
-  drift_ = {};
-  s_.activation.next_drift = tries_ ? &drift_ : nullptr;
+  displacement_ = {};
+  s_.activation.next_displacement = tries_ ? &displacement_ : nullptr;
   if (!s_.activate(status_before, status, stream_)) return false;
   if (s_.flips()) keep_velocities();
   s_.clear_nodes(stream_);
   passes_ = 0;
-  if (tries_ && drift_.lost != 0) patience_ = kActivationsOfPatience;  // no room for the blocks around
-  tries_ = tries_ && drift_.lost == 0;
+  if (tries_ && displacement_.lost != 0) patience_ = kActivationsOfPatience;  // no room for the blocks around
+  tries_ = tries_ && displacement_.lost == 0;
   give_to_nodes(tries_ || pays(following));
   return true;
 }
@@ -299,8 +299,8 @@ bool SortedCpu<T, D>::tries_to_last(int64_t following) {
 template <class T, int D>
 bool SortedCpu<T, D>::lasts(int64_t following) {
   if (!tries_ || following < kLeastPasses) return false;
-  drift_ = {whereabouts_.strays, 0, drift_.earlier + drift_.strays};
-  const bool result = drift_.lasts(in_.x.size(0), kStraysOfRenewal) && reaches();
+  displacement_ = {whereabouts_.out_of_block, 0, displacement_.earlier + displacement_.out_of_block};
+  const bool result = displacement_.lasts(in_.x.size(0), kCpuOutOfBlockCost) && reaches();
   if (!result && passes_ == 0) patience_ = kActivationsOfPatience;
   return result;
 }

@@ -9,7 +9,7 @@ namespace mpm::cuda {
 // Whether a kernel was compiled with this wait: PTX of an older architecture, which newer devices accept too, was not.
 // All kernels are compiled for the same architectures.
 template <class Kernel>
-bool waits_for_kernel_before(Kernel* kernel) {
+bool has_grid_dependency_sync(Kernel* kernel) {
   const auto compiled_for = [&] {
     cudaFuncAttributes attributes;
     check(cudaFuncGetAttributes(&attributes, kernel));
@@ -28,7 +28,7 @@ __device__ inline void let_next_kernel_begin() {
 // To be called by every thread of a kernel launched in a chain, once or more often: before it reads results of the
 // previous kernel, and before it ends. The next kernel starts afterwards, so before its own wait it may read results of
 // kernels before its predecessor.
-__device__ inline void wait_for_kernel_before() {
+__device__ inline void grid_dependency_sync() {
 #if __CUDA_ARCH__ >= 900
   cudaGridDependencySynchronize();
 #endif
@@ -54,11 +54,11 @@ inline cudaLaunchAttribute overlap_attribute() {
   return overlap;
 }
 
-// The kernel must call wait_for_kernel_before().
+// The kernel must call grid_dependency_sync().
 template <class... Parameters, class... Arguments>
 void launch_in_chain(void (*kernel)(Parameters...), unsigned blocks, unsigned threads, size_t shared_memory,
                      cudaStream_t stream, const Arguments&... arguments) {
-  if (!waits_for_kernel_before(kernel)) return launch(kernel, blocks, threads, shared_memory, stream, arguments...);
+  if (!has_grid_dependency_sync(kernel)) return launch(kernel, blocks, threads, shared_memory, stream, arguments...);
   allow_shared_memory(kernel, shared_memory);
   cudaLaunchAttribute overlap = overlap_attribute();
   const cudaLaunchConfig_t config = launch_config(&overlap, 1, blocks, threads, shared_memory, stream);
@@ -68,11 +68,11 @@ void launch_in_chain(void (*kernel)(Parameters...), unsigned blocks, unsigned th
 constexpr unsigned kLargestCluster = 16;  // not every device supports more than 8
 
 // Concurrent thread blocks that may wait for each other, by wait_for_all(): few as one cluster, whose barriers are
-// faster, in a chain like launch_in_chain(). The kernel must call wait_for_kernel_before() first of all.
+// faster, in a chain like launch_in_chain(). The kernel must call grid_dependency_sync() first of all.
 template <class... Parameters, class... Arguments>
 void launch_at_once(void (*kernel)(Parameters...), unsigned blocks, unsigned threads, size_t shared_memory,
                     cudaStream_t stream, const Arguments&... arguments) {
-  if (blocks > kLargestCluster || !waits_for_kernel_before(kernel))
+  if (blocks > kLargestCluster || !has_grid_dependency_sync(kernel))
     return launch_together(kernel, blocks, threads, shared_memory, stream, arguments...);
   allow_shared_memory(kernel, shared_memory);
   cudaLaunchAttribute attributes[2] = {overlap_attribute()};

@@ -4,17 +4,17 @@ namespace mpm::cuda {
 
 // Four values in one memory access: four channels of a node, or a row of nodes of a block.
 template <class T>
-struct alignas(16) Quad {
+struct alignas(16) Vec4 {
   T e[4];
 };
 
 template <class T>
-__device__ Quad<T> load_quad(const T* p) {
-  return *reinterpret_cast<const Quad<T>*>(p);
+__device__ Vec4<T> load_vec4(const T* p) {
+  return *reinterpret_cast<const Vec4<T>*>(p);
 }
 template <class T>
-__device__ void store_quad(T* p, const Quad<T>& q) {
-  *reinterpret_cast<Quad<T>*>(p) = q;
+__device__ void store_vec4(T* p, const Vec4<T>& q) {
+  *reinterpret_cast<Vec4<T>*>(p) = q;
 }
 
 }  // namespace mpm::cuda
