@@ -324,7 +324,9 @@ def test_arguments_that_are_assigned_are_checked():
         with pytest.raises((TypeError, ValueError), match=f"^{name} must be "):
             setattr(step, name, value)
     step.transfer = "flip"
-    assert step.flip == 0 and step._flip_share == 1
+    moving = state(v=torch.randn(len(state()), 2))
+    expected = mpm.Step(step.grid, step.law, transfer="flip")(moving, 1e-3)
+    assert step.flip == 0 and torch.equal(step(moving, 1e-3).v, expected.v)
     step.boundaries = [mpm.Sphere((0, 0), 1)]
     for change in (lambda b: b.append(3), lambda b: b.__setitem__(0, 3)):
         with pytest.raises(TypeError, match="boundaries must be a list of modules"):

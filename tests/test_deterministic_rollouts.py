@@ -98,5 +98,5 @@ def test_a_number_that_is_not_finite(dim, device):
     v[7] = torch.inf
     step, single = make(dim), make(dim)
     end, expected = both(step, single, state.replace(v=v), 6, DT)
-    assert torch.equal(step._activations.status[:, 1:7], single._activations.status[:, 1:7])
+    assert torch.equal(step.status[:, 1:7], single.status[:, 1:7])
     assert torch.equal(end.x.isfinite(), expected.x.isfinite()) and not bool(end.x.isfinite().all())

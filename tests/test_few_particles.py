@@ -123,7 +123,7 @@ def test_particles_that_leave_on_the_way(dim, device):
     state = state.replace(x=x, v=v)
     step, single = make(dim), make(dim)
     end, expected = both(step, single, state, N, DT)
-    assert torch.equal(step._activations.status[:, 1:7], single._activations.status[:, 1:7])
+    assert torch.equal(step.status[:, 1:7], single.status[:, 1:7])
     there = expected.x.isfinite().all(1)
     assert torch.equal(end.x.isfinite().all(1), there) and torch.equal(end.v.isfinite(), expected.v.isfinite())
     for name in ("x", "v", "F"):

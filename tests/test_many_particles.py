@@ -107,7 +107,7 @@ def test_particles_that_leave_on_the_way(dim, device):
     state = state.replace(x=x, v=v)
     step, single = make(dim, device, walls=None), make(dim, device, walls=None)
     end, expected = both(step, single, state, N, dt_of(dim, device))
-    assert torch.equal(step._activations.status[:, 1:7], single._activations.status[:, 1:7])
+    assert torch.equal(step.status[:, 1:7], single.status[:, 1:7])
     there = expected.x.isfinite().all(1)
     assert torch.equal(end.x.isfinite().all(1), there) and torch.equal(end.v.isfinite(), expected.v.isfinite())
     for name in ("x", "v", "F"):
@@ -124,5 +124,5 @@ def test_a_number_that_is_not_finite_on_the_way(dim, device):
     v[7] = torch.inf
     step, single = make(dim, device), make(dim, device)
     end, expected = both(step, single, state.replace(v=v), 6, dt_of(dim, device))
-    assert torch.equal(step._activations.status[:, 1:7], single._activations.status[:, 1:7])
+    assert torch.equal(step.status[:, 1:7], single.status[:, 1:7])
     assert torch.equal(end.x.isfinite(), expected.x.isfinite()) and not bool(end.x.isfinite().all())

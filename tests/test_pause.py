@@ -208,6 +208,9 @@ def test_what_is_counted_belongs_to_no_transform(device):
         return step(state, dt).x.square().sum() + heat(state, dt).temperature.square().sum()
 
     torch.func.grad(torch.func.grad(end))(times(-DT, device))
-    for count in (step._activations.refused, heat._activations.refused, heat.unsolved, heat.residual):
+    counts = [problem.count for problem in step.failures().problems.values()]
+    for count in (*counts, heat.unsolved, heat.residual):
         assert not torch._C._functorch.is_functorch_wrapped_tensor(count)
     assert step.failures().problems["dt"].count.tolist() == [1]
+    with pytest.raises(mpm.SimulationError, match=r"1 .*had a dt that was negative"):
+        heat.check()

@@ -55,8 +55,8 @@ def test_a_scene_that_flies_apart(dim, device):
     step, single = (make(dim, 2, "water", dx=dx, grid={"deterministic": True, "max_blocks": 3000}) for _ in range(2))
     end, expected = both(step, single, state, 40, 2.5e-4)
     step.check(end)
-    assert int(single._activations.status[0, 0]) > blocks  # wanted at most
-    assert torch.equal(step._activations.status[0, 7], single._activations.status[0, 7])  # and by the last step
+    assert int(single.status[0, 0]) > blocks  # wanted at most
+    assert torch.equal(step.status[0, 7], single.status[0, 7])  # and by the last step
     assert_same(end, expected, 1e-3)
 
 
@@ -98,8 +98,8 @@ def test_particles_that_leave_on_the_way(deterministic, device):
     grid = {"deterministic": deterministic}
     step, single = make(2, 3, "neo_hookean", grid=grid), make(2, 3, "neo_hookean", grid=grid)
     end, expected = both(step, single, state)
-    assert torch.equal(step._activations.status[:, 1:], single._activations.status[:, 1:])
-    assert torch.equal(step._activations.status[1:, 0], single._activations.status[1:, 0])
+    assert torch.equal(step.status[:, 1:], single.status[:, 1:])
+    assert torch.equal(step.status[1:, 0], single.status[1:, 0])
     there = expected.x.isfinite().all(1)
     assert torch.equal(end.x.isfinite().all(1), there) and torch.equal(end.v.isfinite(), expected.v.isfinite())
     assert relative_error(end.x[there].double(), expected.x[there]) < 2e-5
