@@ -15,6 +15,7 @@ from torch_mpm.data import folder as folders
 from torch_mpm.data.folder import DatasetFolder, DatasetRecord
 from torch_mpm.data.metadata import connectivity_radius, metadata
 from torch_mpm.data.shard import record_path, shard_path
+from torch_mpm.data.whole_files import write_record
 from torch_mpm.errors import DamagedFileError
 
 
@@ -192,6 +193,25 @@ def test_records_have_checksums(tmp_path, record):
         (path / record).write_text(text[:k] + other + text[k + 1 :])
         with pytest.raises(DamagedFileError):
             DatasetFolder(path).scenes()
+
+
+@pytest.mark.parametrize("wrong", [3, "text", [1], {"a": 1}, None], ids=repr)
+def test_values_of_another_type_in_a_record_are_errors_or_converted(tmp_path, wrong):
+    """With a checksum that fits; the fields that are read have their types."""
+    folder = datasets.make_dataset(tmp_path / "set")
+    words = json.loads((folder / "dataset.json").read_text())
+    del words["checksum"]
+    expected = datasets.record()
+    for name in words:
+        write_record(folder / "dataset.json", {**words, name: wrong})
+        try:
+            record = DatasetRecord.read(folder)
+        except DamagedFileError as error:
+            assert "dataset.json" in str(error)
+            continue
+        for key, value in vars(expected).items():
+            assert type(getattr(record, key)) is type(value), (name, key)
+        assert all(isinstance(text, str) for text in (*record.versions, *record.versions.values(), *record.fields))
 
 
 def test_records_of_before_are_read(tmp_path):

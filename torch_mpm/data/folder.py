@@ -177,6 +177,9 @@ class DatasetRecord:
             words["fields"] = tuple(map(str, words["fields"]))
             words["title"] = str(words.get("title", ""))
             words["title"].encode()  # no lone surrogates, which no file can hold
+            words["versions"] = {str(name): str(version) for name, version in words.get("versions", {}).items()}
+            for name in ("configuration", "device"):
+                words[name] = str(words.get(name, ""))
             words["splits"] = {str(n): (count(first), count(of)) for n, (first, of) in words["splits"].items()}
             words["added"] = tuple((str(n), count(first), count(of)) for n, first, of in words.get("added", ()))
             record = cls(**words)
