@@ -158,6 +158,7 @@ def _child(work: Callable[[], int], output: int, memory: int, begins: int) -> No
         size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (size + memory, size + memory))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # Shells start background processes that ignore it.
         os.write(begins, b"1")
         status = work()
         signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))  # the case is over
