@@ -7,15 +7,7 @@ from . import _library as _library
 from . import _moved, laws, ops
 from .boundaries import SDF, Box, Capsule, Obstacle, Plane, Revolved, Sphere, Walls, Waypoints
 from .data.trajectory import Trajectory
-from .errors import (
-    DamagedFileError,
-    FrontWarning,
-    GridOverflowError,
-    LockingWarning,
-    PrecisionWarning,
-    SimulationError,
-    ThinWallWarning,
-)
+from .errors import DamagedFileError, FrontWarning, GridOverflowError, LockingWarning, PrecisionWarning, SimulationError
 from .geometry import seed, shapes
 from .grid.grid import Blocks, Grid
 from .heat import Heat
@@ -87,7 +79,6 @@ __all__ = [
     "State",
     "Step",
     "Table",
-    "ThinWallWarning",
     "Trajectory",
     "Walls",
     "Waypoints",

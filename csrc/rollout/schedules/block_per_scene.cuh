@@ -1,6 +1,5 @@
 #pragma once
 
-#include "grid/contact.h"
 #include "rollout/schedules/block_per_scene.h"
 #include "transfer/advance_gather.cuh"
 #include "transfer/scatter.cuh"
@@ -463,9 +462,13 @@ class SceneStep {
         node = {T(0), zero_vector<T, D>()};
         continue;
       }
-      const SlotUpdate<T, D> there = slot_update(update, slot);
-      NodeRow<T, D> row = update_node(update, there, local, node);
-      if (a.obstacles) row.value = after_contact(contact, there.scene, there.corner, local, row.value);
+      NodeRow<T, D> row = update_node(update, slot_update(update, slot), local, node);
+      if (a.obstacles) {
+        const ContactSlot<T, D> there = contact_slot(contact, slot);
+        if (there.active)
+          row.value = after_obstacles(contact, there, contact.obstacles, node_position(contact, there.corner, local),
+                                      row.value);
+      }
       node = row;
     }
     __syncthreads();
