@@ -1,4 +1,5 @@
 import os
+import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -28,6 +29,9 @@ def pytest_configure() -> None:
     sanitizers = os.environ.get("TORCH_MPM_SANITIZE", "")
     if sanitizers and info()["build"]["cpu"]["sanitize"] != sanitizers:
         raise pytest.UsageError(f"{_library.CPU_LIBRARY} is not built with TORCH_MPM_SANITIZE={sanitizers}")
+    for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
+        if signal.getsignal(number) is signal.SIG_IGN:  # As in the background, which processes of tests would inherit.
+            signal.signal(number, handler)
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

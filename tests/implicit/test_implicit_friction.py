@@ -233,7 +233,8 @@ def test_a_bad_scene_leaves_the_others_alone(device):
     v[len(one) + 3] = torch.nan
     bad = step(together.replace(v=v), 1e-2)
     assert step.solve_report.converged.tolist() == [True, False]
-    assert torch.equal(bad.x[: len(one)], good.x[: len(one)])
+    # On CUDA sums of atomics differ by rounding, and with them the solve within its tolerance.
+    torch.testing.assert_close(bad.x[: len(one)], good.x[: len(one)], rtol=0, atol=1e-9 if device == "cuda" else 0)
 
 
 @pytest.mark.parametrize("count", [0, 1])
