@@ -386,11 +386,14 @@ def test_times_of_another_batch_are_errors(device: str) -> None:
                 use(late, 1e-5)
 
 
-def test_a_time_step_of_whole_numbers_pauses_nothing(device: str) -> None:
+@pytest.mark.parametrize("dtype", [torch.int64, torch.bool, torch.complex64])
+def test_a_time_step_of_another_kind_pauses_nothing(dtype: torch.dtype, device: str) -> None:
     """As a whole number it is zero, which pauses a scene."""
-    dt = torch.tensor([1e-4], device=device).long()
-    with pytest.raises(TypeError, match=r"^dt must be a number or a floating tensor, got torch\.int64"):
-        mpm.Step(lattice(), mpm.NeoHookean(**SOLID))(batch(device), dt)
+    dt = torch.tensor([1e-4], device=device).to(dtype)
+    step = mpm.Step(lattice(), mpm.NeoHookean(**SOLID))
+    for use in (step, lambda s, dt: mpm.rollout(step, s, 2, dt)):
+        with pytest.raises(TypeError, match=rf"^dt must be a number or a floating tensor, got {dtype}"):
+            use(batch(device), dt)
 
 
 # ---- ops

@@ -47,7 +47,7 @@ OPTIONAL = (
     "friction|gradient|grad_.*|gravity|heat|held|hook|ids|images|impulse|latent_heat|local|lower|material|max_blocks|"
     "melting_point|moment|norms|obstacles|particles|previous.*|record|rotation|scene|scene_.*|scenes|source|stiffness|"
     "stress|temperature|theta|truncate|upper|velocity|viscosity|volume|volume_correction|walls|along_.*|energy|speed|"
-    "nodes|dim|walls|on_grid|on_particles|graph|normal|extra|data|parameter|end"
+    "nodes|dim|walls|on_grid|on_particles|graph|normal|extra|data|parameter|end|(x_)?residual"
 )
 FLAGS = (
     "affine",
@@ -76,8 +76,8 @@ FITTING: tuple[tuple[str, str, str, str], ...] = (
         ".*NaN",
         "numbers that no memory depends on; the functions that call the ops have checked them",
     ),
-    ("law_.*", "parameters", r"[[]\d[]] one dimension more", "a tensor [1]"),
-    ("ops[.]plan_substeps", ".*", "= .*|complex", "torch makes a bool of it; numbers that no memory depends on"),
+    ("(law_|ops[.]substeps).*", "parameters", r"[[]\d[]] one dimension more", "a tensor [1]"),
+    ("ops[.]plan_substeps", ".*", "= .*|complex|None", "torch makes a bool of it; numbers that no memory depends on"),
     ("ops[.]latest_schedule", "like", ".*", "a tensor of any shape has a device"),
     ("ops[.]law_.*", "parameters", ".*(axis 0|one dimension more)", "uniform, or of more scenes than have particles"),
     (

@@ -273,7 +273,7 @@ def _grids_and_states() -> dict[str, Callable[[], Call]]:
     def state() -> Call:
         s = _World().batch()[1]
         names = inspect.signature(mpm.State).parameters
-        given = {name: getattr(s, name) for name in names}
+        given = {name: getattr(s, name) for name in names if not name.startswith("_")}
         ids, material = torch.arange(POINTS), torch.zeros(POINTS, dtype=torch.int32)
         return mpm.State, {**given, "ids": ids, "material": material, "extra": {"a": s.mass}}
 

@@ -115,6 +115,11 @@ def _fake_record(x: Tensor) -> Tensor:
     return x.new_empty(torch.library.get_ctx().new_dynamic_size(), dtype=torch.uint8)
 
 
+@torch.library.register_fake("torch_mpm::latest_schedule")
+def _latest_schedule_fake(like):
+    raise ValueError(f"like must be on a device that computes steps, got {like.device}")
+
+
 @torch.library.register_fake("torch_mpm::substeps_backward")
 def _backward_fake(grad_x, grad_v, grad_C, grad_F, grad_J, grad_history, grad_impulse, needs, record, *arguments):
     given = dict(zip(_SCHEMA, arguments, strict=False))

@@ -285,6 +285,8 @@ class Step(TensorModule):
         cuda = dt.device.type == "cuda"
         if cuda and self._read_dt is not None:
             return self._read_dt
+        if not dt.is_floating_point():
+            return math.inf  # The step refuses it.
         if dt.is_meta or is_traced(dt) or is_captured(dt) or is_transformed():
             return math.inf
         values = dt.detach()
