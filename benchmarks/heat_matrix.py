@@ -1,4 +1,4 @@
-"""The gradients of which the matrix of the heat solve consists, H_ij = Σ_p κ_p V_p ∇Φ_i · ∇Φ_j, in plain torch."""
+"""Gradients of the shape functions in the heat matrix H_ij = Σ_p κ_p V_p ∇Φ_i · ∇Φ_j, in plain torch."""
 
 from __future__ import annotations
 

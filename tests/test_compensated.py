@@ -275,7 +275,8 @@ def test_a_scene_file_of_slow_steel_moves(tmp_path):
     pytest.importorskip("pydantic")
     pytest.importorskip("h5py")
     from torch_mpm.scene import Scene
-    from torch_mpm.state.state_file import load, save, tensors_of
+    from torch_mpm.state.state import tensors_of
+    from torch_mpm.state.state_file import load, save
 
     scene = Scene(
         grid={"lower": (0, 0), "upper": (1, 1), "dx": 0.05},

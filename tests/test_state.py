@@ -125,10 +125,11 @@ def test_gradients_through_joining_and_selecting():
 
 def test_time_of_every_scene_in_a_checkpoint(tmp_path):
     from torch_mpm.state import state_file
+    from torch_mpm.state.state import tensors_of
 
     pytest.importorskip("h5py")
     state = mpm.State.concatenate([block(3).replace(time=0.1), block(2).replace(time=0.2)], scene=True)
-    state_file.save(tmp_path / "state.h5", state_file.tensors_of(state), {"time": 0.0})
+    state_file.save(tmp_path / "state.h5", tensors_of(state), {"time": 0.0})
     loaded, _ = state_file.load(tmp_path / "state.h5")
     assert torch.equal(loaded.time, state.time) and torch.equal(loaded.x, state.x)
 

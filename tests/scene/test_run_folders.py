@@ -21,6 +21,7 @@ from torch_mpm.scene import Scene
 from torch_mpm.scene.folder import read_run
 from torch_mpm.scene.run import Interrupted
 from torch_mpm.state import state_file
+from torch_mpm.state.state import tensors_of
 
 FILES = ("run.json", "checkpoint.h5", "trajectory.partial.h5")
 DAMAGE = {
@@ -85,13 +86,13 @@ def test_a_full_disk_ends_with_its_message(scene, tmp_path, size):
 def test_a_checkpoint_that_does_not_fit_leaves_the_one_before(tmp_path):
     path = tmp_path / "checkpoint.h5"
     state = Scene(**disc()).build("cpu").state
-    state_file.save(path, state_file.tensors_of(state), {"time": 1.0})
+    state_file.save(path, tensors_of(state), {"time": 1.0})
     before = path.read_bytes()
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) // 2, hard))
     try:
         with pytest.raises(OSError, match="File too large"):
-            state_file.save(path, state_file.tensors_of(state), {"time": 2.0})
+            state_file.save(path, tensors_of(state), {"time": 2.0})
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert path.read_bytes() == before and [p.name for p in tmp_path.iterdir()] == [path.name]

@@ -164,13 +164,6 @@ def is_same(known: Any, value: Any) -> bool:
     """Whether a value still equals the part of a key that `as_remembered` made of it."""
     if known is value:  # Neither a tensor nor a list or array.
         return True
-    if type(known) is tuple and type(value) is tuple:
-        if len(known) != len(value):
-            return False
-        for a, b in zip(known, value):  # noqa: B905, a loop because this is called at every step
-            if a is not b and not is_same(a, b):
-                return False
-        return True
     if isinstance(known, Remembered):
         return known.is_now(value)
     if isinstance(value, Tensor):
@@ -178,9 +171,10 @@ def is_same(known: Any, value: Any) -> bool:
     if isinstance(value, np.ndarray):
         value = value.tolist()
     if not isinstance(value, (list, tuple)):
-        return known is value or bool(known == value)
-    same_length = isinstance(known, tuple) and len(known) == len(value)
-    return same_length and all(is_same(a, b) for a, b in zip(known, value, strict=True))
+        return bool(known == value)
+    if not isinstance(known, tuple) or len(known) != len(value):
+        return False
+    return all(a is b or is_same(a, b) for a, b in zip(known, value, strict=True))
 
 
 class DeviceConstantCache:

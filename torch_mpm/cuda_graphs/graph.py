@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from ..state.state import FIELDS, State
+from ..state.state import State, tensors_of
 from .memory import GraphMemory
 
 PIECE, PIECES, LEAST_PARTICLES = 2**25, 4, 2**13
@@ -89,10 +89,3 @@ def time_tensor(state: State) -> Tensor:
     if isinstance(state.time, Tensor):
         return state.time
     return torch.full((), state.time, dtype=torch.float64, device=state.x.device)
-
-
-def tensors_of(state: State) -> dict[str, Tensor]:
-    """The tensors of a state by name, those of `extra` as "extra.name"."""
-    fields = {name: getattr(state, name) for name in FIELDS if name != "extra"}
-    fields |= {f"extra.{name}": value for name, value in state.extra.items()}
-    return {name: value for name, value in fields.items() if isinstance(value, Tensor)}

@@ -26,7 +26,7 @@ from torch import Tensor
 from ..boundaries.impulses import Impulses
 from ..errors import check_count, shape_of
 from ..ops.arguments import split_dt
-from ..state.state import PARTICLE_FIELDS, State, check_state
+from ..state.state import EXTRA, PARTICLE_FIELDS, State, check_state, tensors_of
 from ..step.pause import standing
 from ..step.step import Step
 from .run import rollout
@@ -305,10 +305,10 @@ class Environments:
 
     def save(self, path: str | Path, k: int | None = None) -> None:
         """Write all scenes, or scene k only, to an HDF5 file with checksums; needs h5py."""
-        from ..state.state_file import save, tensors_of
+        from ..state.state_file import save
 
         if k is None:
-            clocks = {"time": self.time, f"extra.{FROZEN}": self.frozen.int().repeat_interleave(self.room)}
+            clocks = {"time": self.time, EXTRA + FROZEN: self.frozen.int().repeat_interleave(self.room)}
             tensors, record = tensors_of(self.state) | clocks, {"time": 0.0}
         else:
             one = self.scene(k)

@@ -13,14 +13,14 @@ from torch.autograd.function import once_differentiable
 
 from ..boundaries.control import control_step, steady
 from ..cuda_graphs.capture import Recordings, Same
-from ..cuda_graphs.graph import WorkInFlight, copied, copy_all, tensors_of, time_tensor
+from ..cuda_graphs.graph import WorkInFlight, copied, copy_all, time_tensor
 from ..cuda_graphs.keys import StepKey, autocast_of, surroundings
 from ..cuda_graphs.memory import GraphMemory, on_own_stream
 from ..errors import check_count, shape_of
 from ..grid.grid import own_pools
 from ..laws.mixture import Mixture
 from ..laws.parameters import has_hooks
-from ..state.state import State, check_state
+from ..state.state import EXTRA, State, check_state, tensors_of
 from ..step.clocks import time_after
 from ..step.status import counts_of, uncounted
 from ..step.step import Step
@@ -190,7 +190,7 @@ class GraphedStep:
         fixed = {name: self._recordings.same_content(name, inputs.pop(name)) for name in known.by_content(prepared)}
         wanted = {name for name, t in inputs.items() if torch.is_grad_enabled() and t.requires_grad}
         if alike and wanted:
-            wanted |= {name for name, t in inputs.items() if name in _MOVED or name.startswith("extra.")}
+            wanted |= {name for name, t in inputs.items() if name in _MOVED or name.startswith(EXTRA)}
             wanted = {name for name in wanted if inputs[name].is_floating_point()}
         kinds = frozenset((name, t.shape, t.dtype, t.device, name in wanted) for name, t in inputs.items())
         contents = tuple((name, Same(t)) for name, t in fixed.items())
@@ -211,8 +211,8 @@ _MOVED = ("x", "v", "C", "F", "J", "temperature", "impulse")
 
 
 def _with(state: State, tensors: Mapping[str, Any]) -> State:
-    extra = {name.removeprefix("extra."): value for name, value in tensors.items() if name.startswith("extra.")}
-    fields: dict[str, Any] = {name: value for name, value in tensors.items() if not name.startswith("extra.")}
+    extra = {name.removeprefix(EXTRA): value for name, value in tensors.items() if name.startswith(EXTRA)}
+    fields: dict[str, Any] = {name: value for name, value in tensors.items() if not name.startswith(EXTRA)}
     kept = {name: value for name, value in {**state.extra, **extra}.items() if value is not None}
     return state.replace(**fields, extra=kept)
 

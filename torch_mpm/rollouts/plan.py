@@ -23,7 +23,6 @@ from ..cuda_graphs.capture import (
     is_traced,
     is_transformed,
 )
-from ..cuda_graphs.graph import tensors_of
 from ..errors import check_count, shape_of
 from ..grid.grid import Grid
 from ..laws import CompiledLaw
@@ -34,7 +33,7 @@ from ..laws.parameters import has_hooks
 from ..ops.arguments import check_choice, split_dt
 from ..ops.contact import MAX_OBSTACLES, fusible
 from ..ops.obstacle_tables import numbers_of_a_step, path_requires_grad
-from ..state.state import State, check_state
+from ..state.state import State, check_state, tensors_of
 from ..step.clocks import StepTimes, requires_grad
 from ..step.status import ActivationRecord
 from ..step.step import Step

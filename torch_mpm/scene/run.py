@@ -23,7 +23,7 @@ from ..grid.topology import Status
 from ..laws import Mixture
 from ..rollouts import rollout
 from ..state import state_file
-from ..state.state import State, _take_all
+from ..state.state import State, _take_all, tensors_of
 from ..step.stability import LawDiagnostics
 from . import fields, heap
 from .build import Built
@@ -259,7 +259,7 @@ class Simulation:
         if type(emitted) is not int or not 0 <= emitted <= len(self.emissions):
             return f"has {emitted} layers of {len(self.emissions)} from the emitters"
         count = len(self.state) + sum(len(self.built.nozzles[k].layer) for _, k in self.emissions[:emitted])
-        fields = set(state_file.tensors_of(self.state)) - set(state_file.tensors_of(state))
+        fields = set(tensors_of(self.state)) - set(tensors_of(state))
         if fields or len(state) != count or state.x.dtype != self.state.x.dtype:
             return f"has not the {count} particles of this run with all their fields"
         ids = state.ids.cpu() if state.ids is not None else torch.empty(0)
@@ -337,7 +337,7 @@ class Simulation:
             "fingerprint": self.fingerprint,
             "totals": dict(vars(self.totals)),
         }
-        return Frame(self.frame, copies, scalars, state_file.tensors_of(state), record)
+        return Frame(self.frame, copies, scalars, tensors_of(state), record)
 
     def _show(self, state: State, diagnostics: LawDiagnostics) -> tuple[Copies, dict[str, Tensor]]:
         """Copies and sums of a state for the next frame, without waiting for them."""
@@ -567,7 +567,7 @@ def _save_last_good(folder: Path, state: State, failure: SceneFailure) -> str:
     path = folder / LAST_GOOD
     record = {"time": float(state.time), "failure": str(failure)}
     try:
-        state_file.save(path, {k: v.cpu() for k, v in state_file.tensors_of(state).items()}, record)
+        state_file.save(path, {k: v.cpu() for k, v in tensors_of(state).items()}, record)
     except OSError as error:
         return f"The last good state could not be stored: {error.strerror or error}."
     return f"The state before it is in {path}."

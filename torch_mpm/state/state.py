@@ -470,6 +470,17 @@ def _is_alike(a: Any, b: Tensor) -> bool:
     return a is b or (isinstance(a, Tensor) and a.shape == b.shape and a.dtype == b.dtype and a.device == b.device)
 
 
+EXTRA = "extra."
+"""Prefix of names in `State.extra` where all tensors of a state have names."""
+
+
+def tensors_of(state: State) -> dict[str, Tensor]:
+    """Tensors of a state by name, those of `extra` as "extra.NAME"."""
+    fields = {name: getattr(state, name) for name in FIELDS if name != "extra"}
+    fields |= {EXTRA + name: value for name, value in state.extra.items()}
+    return {name: value for name, value in fields.items() if isinstance(value, Tensor)}
+
+
 def check_state(state: Any) -> None:
     if not isinstance(state, State):
         raise TypeError(f"state must be a State, got {shape_of(state)}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import io
 import json
 import os
@@ -15,18 +14,10 @@ from torch import Tensor
 from ..data.hdf5 import h5py_module, open_sealed, seal
 from ..data.whole_files import building_path
 from ..errors import DamagedFileError
-from .state import State, _as_soa
+from .state import EXTRA, State, _as_soa
 
 Host = dict[str, Tensor]
 REMEDY = "remove it and add --resume to simulate from the start"
-EXTRA = "extra."
-
-
-def tensors_of(state: State) -> Host:
-    """Tensors of a state by name, those of `extra` as "extra.NAME"."""
-    fields = {f.name: getattr(state, f.name) for f in dataclasses.fields(state)}
-    fields |= {EXTRA + name: value for name, value in state.extra.items()}
-    return {name: value for name, value in fields.items() if isinstance(value, Tensor)}
 
 
 def save(path: Path, tensors: Host, record: dict[str, Any]) -> None:
