@@ -7,7 +7,15 @@ from . import _library as _library
 from . import _moved, laws, ops
 from .boundaries import SDF, Box, Capsule, Obstacle, Plane, Revolved, Sphere, Walls, Waypoints
 from .data.trajectory import Trajectory
-from .errors import DamagedFileError, FrontWarning, GridOverflowError, LockingWarning, PrecisionWarning, SimulationError
+from .errors import (
+    DamagedFileError,
+    FrontWarning,
+    GridOverflowError,
+    LockingWarning,
+    PrecisionWarning,
+    SimulationError,
+    ThinWallWarning,
+)
 from .geometry import seed, shapes
 from .grid.grid import Blocks, Grid
 from .heat import Heat
@@ -79,6 +87,7 @@ __all__ = [
     "State",
     "Step",
     "Table",
+    "ThinWallWarning",
     "Trajectory",
     "Walls",
     "Waypoints",

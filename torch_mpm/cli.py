@@ -281,6 +281,7 @@ def _draw_with_a_bar(folder: Path, scene: Any) -> list[Path]:
 
 
 def _check(options: argparse.Namespace) -> None:
+    from .boundaries.thickness import thin_walls
     from .grid import resolution
     from .scene import Scene
     from .scene.substeps import check_substeps
@@ -289,9 +290,19 @@ def _check(options: argparse.Namespace) -> None:
     built = scene.build("cpu")
     if unresolved := resolution.problem(built.grid, built.state.x.dtype):
         print(f"{options.scene}: warning: grid: {unresolved}", file=sys.stderr)
+    for thin in thin_walls(built.step.boundaries.entries, built.grid.dx):
+        print(f"{options.scene}: warning: {thin}", file=sys.stderr)
+    if built.projected is not None:
+        print(f"{options.scene}: {_projected(built.projected.tolist())}")
     substeps = check_substeps(scene, built)
     contents = f"{built.particles} particles in {len(built.scenes)} scene(s), {scene.frames + 1} frames"
     print(f"{options.scene}: good, {contents}, about {substeps} substeps")
+
+
+def _projected(counts: Sequence[int]) -> str:
+    """How many particles of each scene were moved out of obstacles."""
+    each = f" ({', '.join(map(str, counts))} in each scene)" if len(counts) > 1 else ""
+    return f"{sum(counts)} particles were moved out of obstacles{each}"
 
 
 def _info(options: argparse.Namespace) -> None:
@@ -376,6 +387,8 @@ def _print_summary(summary: dict[str, Any], files: dict[str, Path]) -> None:
     print(f"{'mass drift':>24}  {summary['mass_drift']:.1e}")
     print(f"{'largest CFL number':>24}  {summary['largest_cfl']:.3f}")
     print(f"{'particles lost':>24}  {summary['particles_lost'] or 'none'}")
+    if "particles_projected" in summary:
+        print(f"{'obstacles':>24}  {_projected(summary['particles_projected'])}")
     for name, path in files.items():
         print(f"{name:>24}  {path}")
 

@@ -51,6 +51,10 @@ class LockingWarning(UserWarning):
     """A nearly incompressible body bends too little on the lattice."""
 
 
+class ThinWallWarning(UserWarning):
+    """A wall is so thin that material on one side moves the nodes on the other."""
+
+
 class DamagedFileError(ValueError):
     """File of a run that is damaged, was changed by another program, or is of another kind."""
 

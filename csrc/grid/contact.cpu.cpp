@@ -1,5 +1,6 @@
+#include "grid/contact.h"
+
 #include "cpu/parallel.h"
-#include "grid/obstacle.h"
 
 namespace mpm::cpu {
 inline namespace TORCH_MPM_ISA {

@@ -1,5 +1,6 @@
+#include "grid/contact.h"
+
 #include "cuda/launch.cuh"
-#include "grid/obstacle.h"
 #include "grid/slot_lanes.cuh"
 
 namespace mpm::cuda {

@@ -1,7 +1,7 @@
 #pragma once
 
+#include "grid/contact.h"
 #include "grid/grid_update.h"
-#include "grid/obstacle.h"
 
 // Impulses on the walls of the domain, and on obstacles: the physics is that of the grid update and of contact.
 namespace mpm {
@@ -53,23 +53,25 @@ template <int Lanes, class T, int D, class Put>
 MPM_HD void slot_contact_impulses(const ContactImpulsesArguments<T, D>& a, int slot, int lane, Put&& put) {
   constexpr int count = kBlockNodes<D> / Lanes;
   const ContactArguments<T, D>& c = a.contact;
-  const ContactSlot<T, D> s = contact_slot(c, slot);
+  const SlotPoses<T, D> poses(c, slot);
+  const ContactSlot<T, D>& s = poses.s;
   if (!s.active || s.scene >= a.impulse.scenes) return;
   const int64_t first = int64_t(slot) * kBlockNodes<D> + lane;
-  Vector<T, D> v[count];
-  for (int n = 0; n < count; n++) v[n] = load_node<T, D>(c.velocity, c.stride, first + n * Lanes);
-  for (int k = 0; k < c.obstacles; k++) {
-    const ObstaclePose<T, D> pose = pose_at(c, s, k);
-    if (!pose.acts) continue;
+  NodeContact<T, D> contact[count];
+  for (int n = 0; n < count; n++)
+    if (s.near && a.mass[(first + n * Lanes) * a.mass_stride] != T(0))
+      contact[n] = contact_of_node(poses, node_position(c, s.corner, lane + n * Lanes));
+  for (uint64_t left = s.near; left; left &= left - 1) {
+    const int k = lowest_bit(left);
     ImpulseSum<D> sum;
     for (int n = 0; n < count; n++) {
-      const int local = lane + n * Lanes;
-      const Touch<T, D> t = touch(c, pose, node_position(c, s.corner, local));
-      if (!t.touching) continue;
-      const Vector<T, D> after = after_contact(pose, t, v[n]);
+      if (!contact[n].meets(k)) continue;
       const T mass = a.mass[(first + n * Lanes) * a.mass_stride];
-      sum.add(lattice_position(a.impulse, lattice_node<D>(s.corner, local)), mass * (v[n] + T(-1) * after));
-      v[n] = after;
+      const Vector<double, D> at = lattice_position(a.impulse, lattice_node<D>(s.corner, lane + n * Lanes));
+      taken_by_obstacles(poses, contact[n], load_node<T, D>(c.velocity, c.stride, first + n * Lanes),
+                         [&](int owner, const Vector<T, D>& taken) {
+                           if (owner == k) sum.add(at, mass * taken);
+                         });
     }
     put(s.scene, k, sum);
   }

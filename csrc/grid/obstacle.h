@@ -8,7 +8,7 @@
 #include "grid/impulse.h"
 #include "grid/lattice_node.h"
 
-// Rigid obstacles: which nodes are inside, the velocity of those after contact, and its adjoints.
+// Rigid obstacles: the arguments of contact, poses, and the distance and faces of shapes.
 namespace mpm {
 
 enum class ObstacleShape : int { plane = 0, sphere = 1, box = 2, capsule = 3, revolved = 4, sampled = 5 };
@@ -41,6 +41,9 @@ struct ContactArguments {
   Geometry<T, D> geometry;
   double dx, lower[D];
   T rounding;  // distance within which a node lies on a surface [m]
+  // The walls of the domain, 2 i the lower and 2 i + 1 the upper one of axis i: see grid/solid.h.
+  Contact wall_kind[2 * D];
+  T wall_plane[2 * D];
   int max_blocks = 0;
   const int* block = nullptr;  // [max_blocks] block of a slot, -1 where unused
   int obstacles = 0;
@@ -64,7 +67,8 @@ struct ContactArguments {
   const int *activations = nullptr, *activations_before = nullptr;
   const T* velocity = nullptr;  // node i at velocity + i * stride
   const T* grad = nullptr;      // likewise; backward only
-  int64_t stride = 0, grad_stride = 0;
+  const T* mass = nullptr;      // likewise, or null; nodes without mass keep their velocity
+  int64_t stride = 0, grad_stride = 0, mass_stride = 0;
   T* result =
       nullptr;  // rows [max_blocks * 4^D, 1 + D] as of the grid update, the first column zero or a mass' adjoint
   T* row_grad = nullptr;  // adjoint of the rows by each slot [max_blocks, obstacles, width], or null; backward only
@@ -147,11 +151,14 @@ MPM_HD ObstaclePose<S, D> obstacle_pose(const ContactArguments<T, D>& a, const O
 }
 
 // Signed distance of a point (distance from the axis, position along it) from a closed polygon, and the outward normal
-// of its nearest edge; among equals, the first counts.
+// of its nearest edge; among equals, the first counts. `second` is the distance of the edge that is nearest but for
+// this one.
 template <class S>
-MPM_HD S polygon_surface(const ValueOf<S>* corner, int corners, const Vector<S, 2>& p, Vector<S, 2>& normal) {
+MPM_HD S polygon_surface(const ValueOf<S>* corner, int corners, const Vector<S, 2>& p, Vector<S, 2>& normal,
+                         ValueOf<S>& second) {
   using T = ValueOf<S>;
   S nearest = S(std::numeric_limits<T>::max());
+  second = std::numeric_limits<T>::max();
   normal = zero_vector<S, 2>();
   bool inside = false;
   for (int k = 0; k < corners; k++) {
@@ -171,8 +178,11 @@ MPM_HD S polygon_surface(const ValueOf<S>* corner, int corners, const Vector<S, 
       offset = arm + (along > S(0) ? S(0) - along : S(0)) * edge;
     const S distance = length(offset);
     if (distance < nearest) {
+      second = value_of(nearest);
       nearest = distance;
       normal = direction(Vector<S, 2>{{edge[1], S(0) - edge[0]}});
+    } else if (value_of(distance) < second) {
+      second = value_of(distance);
     }
   }
   return inside ? S(0) - nearest : nearest;
@@ -231,9 +241,11 @@ MPM_HD S sampled_surface(const ValueOf<S>* data, int numbers, const Vector<S, D>
 }
 
 // Signed distance of a point in body coordinates, and the unit normal out of the body: right inside, zero where the
-// shape has none. Outside, the distance is a lower bound.
+// shape has none. Outside, the distance is a lower bound. `second` is the distance of a second face of the shape, where
+// its faces may join at inner edges: the least number where they are not known one by one, and else the largest.
 template <class T, int D>
-MPM_HD T surface(const ObstaclePose<T, D>& o, const Vector<T, D>& body, Vector<T, D>& normal) {
+MPM_HD T surface(const ObstaclePose<T, D>& o, const Vector<T, D>& body, Vector<T, D>& normal, ValueOf<T>& second) {
+  second = std::numeric_limits<ValueOf<T>>::max();
   Vector<T, D> extent;
   MPM_UNROLL for (int i = 0; i < D; i++)
     extent[i] = o.row->extent[i];
@@ -257,11 +269,15 @@ MPM_HD T surface(const ObstaclePose<T, D>& o, const Vector<T, D>& body, Vector<T
     const T along = dot(body, axis);
     const Vector<T, D> across = body + (T(0) - along) * axis;
     Vector<T, 2> plane_normal;
-    const T distance = polygon_surface(o.data, o.numbers / 2, Vector<T, 2>{{length(across), along}}, plane_normal);
+    const T distance =
+        polygon_surface(o.data, o.numbers / 2, Vector<T, 2>{{length(across), along}}, plane_normal, second);
     normal = plane_normal[0] * direction(across) + plane_normal[1] * axis;
     return distance;
   }
-  if (o.shape == ObstacleShape::sampled) return sampled_surface(o.data, o.numbers, body, normal);
+  if (o.shape == ObstacleShape::sampled) {
+    second = std::numeric_limits<ValueOf<T>>::lowest();
+    return sampled_surface(o.data, o.numbers, body, normal);
+  }
   Vector<T, D> offset = body;
   if (o.shape == ObstacleShape::capsule) {
     const T squared = dot(extent, extent);
@@ -274,49 +290,103 @@ MPM_HD T surface(const ObstaclePose<T, D>& o, const Vector<T, D>& body, Vector<T
   return distance - o.row->radius;
 }
 
-// A node seen by an obstacle.
-template <class S, int D>
-struct Touch {
-  bool touching;
-  Vector<S, D> normal, surface_velocity;
-};
+template <class T, int D>
+MPM_HD T surface(const ObstaclePose<T, D>& o, const Vector<T, D>& body, Vector<T, D>& normal) {
+  ValueOf<T> second;
+  return surface(o, body, normal, second);
+}
 
-template <class S, class T, int D>
-MPM_HD Touch<S, D> touch(const ContactArguments<T, D>& a, const ObstaclePose<S, D>& o, const Vector<T, D>& position) {
-  Touch<S, D> t;
-  Vector<S, D> arm, normal;
-  MPM_UNROLL for (int i = 0; i < D; i++)
-    arm[i] = lift<S>(position[i]) - o.centre[i];
-  t.touching = value_of(surface(o, transpose(o.rotation) * arm, normal)) <= a.rounding;
-  if (!t.touching) return t;
-  t.normal = o.rotation * normal;
+// Velocity of an obstacle's matter at a position.
+template <class S, int D>
+MPM_HD Vector<S, D> velocity_at(const ObstaclePose<S, D>& o, const Vector<ValueOf<S>, D>& position) {
+  Vector<S, D> arm, velocity;
   const auto& rate = o.row->angular_velocity;
   MPM_UNROLL for (int i = 0; i < D; i++)
-    t.surface_velocity[i] = o.row->velocity[i];
+    arm[i] = lift<S>(position[i]) - o.centre[i], velocity[i] = o.row->velocity[i];
   if constexpr (D == 2) {
-    t.surface_velocity[0] = t.surface_velocity[0] - rate[0] * arm[1];
-    t.surface_velocity[1] = t.surface_velocity[1] + rate[0] * arm[0];
+    velocity[0] = velocity[0] - rate[0] * arm[1];
+    velocity[1] = velocity[1] + rate[0] * arm[0];
   } else {
     MPM_UNROLL for (int i = 0; i < 3; i++) {
       const int j = (i + 1) % 3, k = (i + 2) % 3;
-      t.surface_velocity[i] = t.surface_velocity[i] + (rate[j] * arm[k] - rate[k] * arm[j]);
+      velocity[i] = velocity[i] + (rate[j] * arm[k] - rate[k] * arm[j]);
     }
   }
-  return t;
+  return velocity;
 }
 
-// Whether an obstacle may touch a node of the block whose first node is at `first`. Distances change by no more than
-// the way from a point to another; samples of distances do so between the nodes of their lattice, so that the slope of
-// their multilinear interpolant is at most 1 along each axis.
+// ---- the faces of a shape, which contact of several obstacles looks at one by one
+
+// A box has 2 D flat faces, a revolved shape one for each edge of its polygon, any other shape its whole surface.
 template <class T, int D>
-MPM_HD bool near_block(const ContactArguments<T, D>& a, const ObstaclePose<T, D>& o, const Vector<T, D>& first) {
-  const T half = T(0.5 * (kBlockWidth - 1) * a.dx);
-  Vector<T, D> arm, normal;
+MPM_HD int face_count(const ObstaclePose<T, D>& o) {
+  return o.shape == ObstacleShape::box ? 2 * D : o.shape == ObstacleShape::revolved ? o.numbers / 2 : 1;
+}
+
+// Whether the height above a face is linear in the position.
+template <class T, int D>
+MPM_HD bool is_flat(const ObstaclePose<T, D>& o) {
+  return o.shape == ObstacleShape::box || o.shape == ObstacleShape::plane ||
+         (o.shape == ObstacleShape::revolved && D == 2);
+}
+
+// Height of a point (distance from the axis, position along it) above the line of edge k of a polygon; `beyond` is how
+// far the foot of the point is beyond the ends of the edge. Far above where the edge is on the axis, inside the body.
+template <class S>
+MPM_HD S edge_height(const ValueOf<S>* corner, int corners, int k, const Vector<S, 2>& p, Vector<S, 2>& normal,
+                     ValueOf<S>& beyond) {
+  using T = ValueOf<S>;
+  const T *const a = corner + 2 * k, *const b = corner + 2 * (k + 1 < corners ? k + 1 : 0);
+  const Vector<S, 2> edge = {{lift<S>(b[0] - a[0]), lift<S>(b[1] - a[1])}};
+  const Vector<S, 2> arm = {{p[0] - lift<S>(a[0]), p[1] - lift<S>(a[1])}};
+  normal = direction(Vector<S, 2>{{edge[1], S(0) - edge[0]}});
+  const T size = value_of(length(edge)), along = size > T(0) ? value_of(dot(arm, edge)) / size : T(0);
+  beyond = along < T(0) ? T(0) - along : along > size ? along - size : T(0);
+  if (size == T(0) || (a[0] == T(0) && b[0] == T(0))) return S(std::numeric_limits<T>::max());
+  return dot(arm, normal);
+}
+
+// Height of a point in body coordinates above the surface that carries a face, and the unit normal of that; `beyond` is
+// about how far the foot of the point is from the face itself, as far as that is known. Face −1 is the nearest one, the
+// only one whose number `surface` needs.
+template <class S, int D>
+MPM_HD S face_height(const ObstaclePose<S, D>& o, int face, const Vector<S, D>& body, Vector<S, D>& normal,
+                     ValueOf<S>& beyond) {
+  using T = ValueOf<S>;
+  beyond = T(0);
+  if (face >= 0 && o.shape == ObstacleShape::box) {
+    const int axis = face / 2;
+    const S side = S(face % 2 ? 1 : -1);
+    MPM_UNROLL for (int i = 0; i < D; i++)
+      normal[i] = i == axis ? side : S(0);
+    S along = S(0), size = S(0);
+    MPM_UNROLL for (int i = 0; i < D; i++)
+      if (i == axis) along = side * body[i], size = o.row->extent[i];
+    return along - S(0.5) * size;
+  }
+  if (face >= 0 && o.shape == ObstacleShape::revolved) {
+    Vector<S, D> extent;
+    MPM_UNROLL for (int i = 0; i < D; i++)
+      extent[i] = o.row->extent[i];
+    const Vector<S, D> axis = direction(extent);
+    const S along = dot(body, axis);
+    const Vector<S, D> across = body + (S(0) - along) * axis;
+    Vector<S, 2> plane_normal;
+    const S height =
+        edge_height(o.data, o.numbers / 2, face, Vector<S, 2>{{length(across), along}}, plane_normal, beyond);
+    normal = plane_normal[0] * direction(across) + plane_normal[1] * axis;
+    return height;
+  }
+  return surface(o, body, normal);
+}
+
+// A point of the world in the coordinates of an obstacle.
+template <class S, int D>
+MPM_HD Vector<S, D> to_body(const ObstaclePose<S, D>& o, const Vector<ValueOf<S>, D>& position) {
+  Vector<S, D> arm;
   MPM_UNROLL for (int i = 0; i < D; i++)
-    arm[i] = first[i] + half - o.centre[i];
-  const T slope = o.shape == ObstacleShape::sampled ? std::sqrt(T(D)) : T(1);
-  const T reach = slope * std::sqrt(T(D)) * half * T(1.001) + a.rounding;
-  return surface(o, transpose(o.rotation) * arm, normal) <= reach;
+    arm[i] = lift<S>(position[i]) - o.centre[i];
+  return transpose(o.rotation) * arm;
 }
 
 template <class T, int D>
@@ -325,229 +395,6 @@ MPM_HD Vector<T, D> node_position(const ContactArguments<T, D>& a, const int cor
   MPM_UNROLL for (int i = 0; i < D; i++)
     x[i] = T(a.lower[i] + double(lattice_index<D>(corner, i, local) - kPadding) * a.dx);
   return x;
-}
-
-template <class T, int D>
-MPM_HD Vector<T, D> relative_velocity(const Touch<T, D>& t, const Vector<T, D>& v) {
-  return v + T(-1) * t.surface_velocity;
-}
-
-template <class T, int D>
-MPM_HD Vector<T, D> after_contact(Contact contact, const T& friction, const Touch<T, D>& t, const Vector<T, D>& v) {
-  const Vector<T, D> u = relative_velocity(t, v);
-  return v + (contact_velocity(contact, u, t.normal, friction) + T(-1) * u);
-}
-
-template <class T, int D>
-MPM_HD Vector<T, D> after_contact(const ObstaclePose<T, D>& o, const Touch<T, D>& t, const Vector<T, D>& v) {
-  return after_contact(o.contact, o.row->friction, t, v);
-}
-
-// What the nodes of a slot share.
-template <class T, int D>
-struct ContactSlot {
-  bool active = false;
-  int scene = 0;
-  int corner[D] = {};                      // lattice index of the first node
-  const ObstacleRow<T, D>* row = nullptr;  // the obstacles of its scene
-};
-
-// Of an active block of a scene, with the lattice index of its first node.
-template <class T, int D>
-MPM_HD ContactSlot<T, D> contact_slot(const ContactArguments<T, D>& a, int scene, const int (&corner)[D]) {
-  ContactSlot<T, D> s;
-  s.scene = scene;
-  s.active = (a.rows == 1 || scene < a.rows) && (!a.scene_time || a.times == 1 || scene < a.times);
-  s.row = a.row + (a.rows == 1 ? 0 : int64_t(scene) * a.obstacles);
-  if (a.step_stride && a.activations) s.row += step_of_call(a) * a.step_stride;
-  MPM_UNROLL for (int i = 0; i < D; i++)
-    s.corner[i] = corner[i];
-  return s;
-}
-
-template <class T, int D>
-MPM_HD ContactSlot<T, D> contact_slot(const ContactArguments<T, D>& a, int slot) {
-  const int index = a.block[slot];
-  if (index < 0) return {};
-  int corner[D];
-  const int scene = block_coordinates(a.geometry, index, corner);
-  MPM_UNROLL for (int i = 0; i < D; i++)
-    corner[i] *= kBlockWidth;
-  return contact_slot(a, scene, corner);
-}
-
-// The pose of obstacle k; it does not act where it cannot touch the block.
-template <class T, int D>
-MPM_HD ObstaclePose<T, D> pose_at(const ContactArguments<T, D>& a, const ContactSlot<T, D>& s, int k) {
-  ObstaclePose<T, D> pose = obstacle_pose(a, a.kind[k], s.row[k], s.scene);
-  pose.acts = pose.acts && near_block(a, pose, node_position(a, s.corner, 0));
-  return pose;
-}
-
-template <class T, int D>
-MPM_HD Vector<T, D> load_node(const T* values, int64_t stride, int64_t node) {
-  Vector<T, D> v;
-  MPM_UNROLL for (int i = 0; i < D; i++)
-    v[i] = values[node * stride + i];
-  return v;
-}
-
-template <class T, int D>
-MPM_HD void store_node(T* values, int64_t node, const Vector<T, D>& v, const T& first = T(0)) {
-  T* const row = values + node * (1 + D);
-  row[0] = first;
-  MPM_UNROLL for (int i = 0; i < D; i++)
-    row[1 + i] = v[i];
-}
-
-// The first obstacle that touches a node.
-template <class T, int D>
-struct FirstTouch {
-  int obstacle;  // their number where none does
-  Contact contact;
-  T friction;
-  Touch<T, D> touch;
-};
-
-template <class T, int D>
-MPM_HD FirstTouch<T, D> first_touch(const ContactArguments<T, D>& a, const ContactSlot<T, D>& s,
-                                    const Vector<T, D>& position) {
-  FirstTouch<T, D> first;
-  for (first.obstacle = s.active ? 0 : a.obstacles; first.obstacle < a.obstacles; first.obstacle++) {
-    const ObstaclePose<T, D> pose = pose_at(a, s, first.obstacle);
-    if (!pose.acts) continue;
-    first.touch = touch(a, pose, position);
-    if (!first.touch.touching) continue;
-    first.contact = pose.contact;
-    first.friction = pose.row->friction;
-    break;
-  }
-  return first;
-}
-
-// The velocity v of a node after the obstacles from one on until `last`, which act one after another.
-template <class T, int D>
-MPM_HD Vector<T, D> after_obstacles(const ContactArguments<T, D>& a, const ContactSlot<T, D>& s, int first, int last,
-                                    const Vector<T, D>& position, Vector<T, D> v) {
-  for (int k = first; k < last; k++) {
-    const ObstaclePose<T, D> pose = pose_at(a, s, k);
-    if (!pose.acts) continue;
-    const Touch<T, D> t = touch(a, pose, position);
-    if (t.touching) v = after_contact(pose, t, v);
-  }
-  return v;
-}
-
-template <class T, int D>
-MPM_HD Vector<T, D> after_obstacles(const ContactArguments<T, D>& a, const ContactSlot<T, D>& s, int last,
-                                    const Vector<T, D>& position, const Vector<T, D>& v) {
-  return after_obstacles(a, s, 0, last, position, v);
-}
-
-// The same after all of them, of which the first one that touches the node is known.
-template <class T, int D>
-MPM_HD Vector<T, D> after_obstacles(const ContactArguments<T, D>& a, const ContactSlot<T, D>& s,
-                                    const FirstTouch<T, D>& first, const Vector<T, D>& position,
-                                    const Vector<T, D>& v) {
-  if (first.obstacle >= a.obstacles) return v;
-  return after_obstacles(a, s, first.obstacle + 1, a.obstacles, position,
-                         after_contact(first.contact, first.friction, first.touch, v));
-}
-
-// The nodes lane, lane + Lanes, ... of a slot.
-template <int Lanes, class T, int D>
-MPM_HD void slot_contact(const ContactArguments<T, D>& a, int slot, int lane) {
-  constexpr int count = kBlockNodes<D> / Lanes;
-  const ContactSlot<T, D> s = contact_slot(a, slot);
-  const int64_t first = int64_t(slot) * kBlockNodes<D> + lane;
-  Vector<T, D> v[count];
-  for (int n = 0; n < count; n++) v[n] = load_node<T, D>(a.velocity, a.stride, first + n * Lanes);
-  for (int k = 0; s.active && k < a.obstacles; k++) {
-    const ObstaclePose<T, D> pose = pose_at(a, s, k);
-    for (int n = 0; pose.acts && n < count; n++) {
-      const Touch<T, D> t = touch(a, pose, node_position(a, s.corner, lane + n * Lanes));
-      if (t.touching) v[n] = after_contact(pose, t, v[n]);
-    }
-  }
-  for (int n = 0; n < count; n++) store_node(a.result, first + n * Lanes, v[n]);
-}
-
-// The nodes of a slot that an obstacle touches, as the backward pass needs them.
-template <int count, class T, int D>
-struct TouchedNodes {
-  Touch<T, D> touch[count];
-  Vector<T, D> position[count], before[count], grad[count];  // velocity before the contact, adjoint of that after it
-};
-
-// Adjoint of a parameter of an obstacle by some nodes: one directional derivative of the velocities after contact.
-template <int count, class T, int D>
-MPM_HD T parameter_adjoint(const ContactArguments<T, D>& a, const ContactSlot<T, D>& s, int k, int parameter,
-                           const TouchedNodes<count, T, D>& nodes) {
-  using S = Dual<T>;
-  ObstacleRow<S, D> row;
-  const T* const values = reinterpret_cast<const T*>(s.row + k);
-  S* const lifted = reinterpret_cast<S*>(&row);
-  for (int i = 0; i < ObstacleRow<T, D>::width; i++) lifted[i] = S(values[i], i == parameter ? T(1) : T(0));
-  const ObstaclePose<S, D> pose = obstacle_pose(a, a.kind[k], row, s.scene);
-  T sum = T(0);
-  for (int n = 0; n < count; n++) {
-    if (!nodes.touch[n].touching) continue;
-    Vector<S, D> v;
-    MPM_UNROLL for (int i = 0; i < D; i++)
-      v[i] = lift<S>(nodes.before[n][i]);
-    const Vector<S, D> after = after_contact(pose, touch(a, pose, nodes.position[n]), v);
-    MPM_UNROLL for (int i = 0; i < D; i++)
-      sum += nodes.grad[n][i] * after[i].derivative;
-  }
-  return sum;
-}
-
-// `sum_lanes` adds a number over the lanes of a slot; the first lane gets the sum. `impulses(scene, node)` are
-// `NodeImpulses` of a node, or `NoImpulses`.
-template <int Lanes, class T, int D, class SumLanes, class ImpulsesOf>
-MPM_HD void slot_contact_backward(const ContactArguments<T, D>& a, int slot, int lane, SumLanes&& sum_lanes,
-                                  ImpulsesOf&& impulses) {
-  constexpr int count = kBlockNodes<D> / Lanes, width = ObstacleRow<T, D>::width;
-  constexpr bool with_impulses = decltype(impulses(0, 0))::wanted;
-  const ContactSlot<T, D> s = contact_slot(a, slot);
-  const int64_t first = int64_t(slot) * kBlockNodes<D> + lane;
-  TouchedNodes<count, T, D> nodes;
-  T mass_grad[count] = {};
-  for (int n = 0; n < count; n++) nodes.grad[n] = load_node<T, D>(a.grad, a.grad_stride, first + n * Lanes);
-  for (int k = a.obstacles - 1; k >= 0; k--) {
-    ObstaclePose<T, D> pose;
-    pose.acts = false;
-    if (s.active) pose = pose_at(a, s, k);
-    for (int n = 0; pose.acts && n < count; n++) {
-      nodes.position[n] = node_position(a, s.corner, lane + n * Lanes);
-      nodes.touch[n] = touch(a, pose, nodes.position[n]);
-      if (!nodes.touch[n].touching) continue;
-      nodes.before[n] =
-          after_obstacles(a, s, k, nodes.position[n], load_node<T, D>(a.velocity, a.stride, first + n * Lanes));
-      if constexpr (with_impulses) {
-        auto own = impulses(s.scene, first + n * Lanes);
-        const Vector<T, D> after = after_contact(pose, nodes.touch[n], nodes.before[n]);
-        nodes.grad[n] =
-            own.take(own.weight(k, lattice_node<D>(s.corner, lane + n * Lanes)), nodes.before[n], after, nodes.grad[n]);
-        mass_grad[n] += own.mass_grad;
-      }
-    }
-    for (int i = 0; a.row_grad && i < width; i++) {
-      const T sum = pose.acts ? sum_lanes(parameter_adjoint(a, s, k, i, nodes)) : T(0);
-      if (lane == 0) a.row_grad[(int64_t(slot) * a.obstacles + k) * width + i] = sum;
-    }
-    for (int n = 0; pose.acts && n < count; n++) {
-      const Touch<T, D>& t = nodes.touch[n];
-      if (!t.touching) continue;
-      const Vector<T, D> u = relative_velocity(t, nodes.before[n]);
-      nodes.grad[n] = contact_adjoint(pose.contact, u, t.normal, pose.row->friction, nodes.grad[n]);
-      if constexpr (with_impulses) {
-        const auto own = impulses(s.scene, first + n * Lanes);
-        nodes.grad[n] = nodes.grad[n] + own.mass * own.weight(k, lattice_node<D>(s.corner, lane + n * Lanes));
-      }
-    }
-  }
-  for (int n = 0; n < count; n++) store_node(a.result, first + n * Lanes, nodes.grad[n], mass_grad[n]);
 }
 
 }  // namespace TORCH_MPM_ISA

@@ -19,6 +19,25 @@ namespace mpm {
       std::vector<double> end, const OptionalTensor &scene_time, double time
 #define MPM_OBSTACLES_ARGUMENTS obstacles, data, shape, sizes, contact_kind, scene, start, end, scene_time, time
 
+#define MPM_CONTACT_WALLS_PARAMETERS const std::vector<int64_t>&wall_kind, const std::vector<double>&wall_plane
+
+// The walls of the domain beside obstacles; all are open where the lists are empty.
+template <class T, int D>
+void set_walls(ContactArguments<T, D>& a, MPM_CONTACT_WALLS_PARAMETERS) {
+  STD_TORCH_CHECK(wall_kind.empty() || wall_kind.size() == 2 * D, "wall_kind must be empty or have ", 2 * D,
+                  " entries, two per axis, got ", wall_kind.size());
+  STD_TORCH_CHECK(wall_plane.size() == wall_kind.size(), "wall_plane must have an entry per wall_kind, ",
+                  wall_kind.size(), ", got ", wall_plane.size());
+  for (int face = 0; face < 2 * D; face++) {
+    const int64_t kind = wall_kind.empty() ? int64_t(Contact::open) : wall_kind[face];
+    STD_TORCH_CHECK(kind >= int64_t(Contact::open) && kind <= int64_t(Contact::mirror),
+                    "wall_kind must be 0 to 4, got ", kind);
+    const bool bounded = kind != int64_t(Contact::open) && std::isfinite(wall_plane[face]);
+    a.wall_kind[face] = bounded ? Contact(kind) : Contact::open;
+    a.wall_plane[face] = T(bounded ? wall_plane[face] : 0);
+  }
+}
+
 // What does not depend on the activation; `like` has the dtype and device of the nodes. A call of many steps may have
 // obstacles for each of them.
 template <class T, int D>
@@ -78,6 +97,7 @@ ContactArguments<T, D> obstacle_arguments(const Tensor& like, const PackedLattic
   STD_TORCH_CHECK(data.is_contiguous(), "data must be contiguous, got shape ", shape_of(data));
   a.data = static_cast<const T*>(data.data_ptr());
   a.time = time;
+  set_walls(a, {}, {});
   if (has(scene_time)) {
     check_rank(*scene_time, "scene_time", 1);
     check_type(*scene_time, "scene_time", ScalarType::Double, like);

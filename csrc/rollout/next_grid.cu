@@ -2,6 +2,7 @@
 
 #include "cuda/fixed_point.cuh"
 #include "cuda/programmatic_launch.cuh"
+#include "grid/contact.h"
 
 namespace mpm::cuda {
 namespace {
@@ -23,8 +24,7 @@ template <class T, int D>
 struct Node {
   int slot, local;
   SlotUpdate<T, D> there;
-  ContactSlot<T, D> contact;
-  FirstTouch<T, D> touch;
+  LoneNode<T, D> contact;
 
   __device__ int64_t row() const { return int64_t(slot) * kBlockNodes<D> + local; }
   __device__ bool is_in_use() const { return there.active; }
@@ -36,20 +36,19 @@ struct Node {
   __device__ void find(const NextGridArguments<T, D>& a, int at) {
     slot = at;
     there = slot_update(a.update, slot);
-    touch.obstacle = a.contact.obstacles;
+    contact.touch.obstacle = NodeTouch<T, D>::none;
   }
   __device__ void find_obstacles(const NextGridArguments<T, D>& a) {
-    contact = contact_slot(a.contact, there.scene, there.corner);
-    touch = first_touch(a.contact, contact, node_position(a.contact, contact.corner, local));
+    contact.find(a.contact, there.scene, there.corner, local);
   }
 };
 
 template <bool Obstacles, class T, int D>
 __device__ void take_node(const NextGridArguments<T, D>& a, const Node<T, D>& node) {
   NodeRow<T, D> row = update_node(a.update, node.there, node.local, node.sums(a));
-  if constexpr (Obstacles)
-    row.value = after_obstacles(a.contact, node.contact, node.touch,
-                                node_position(a.contact, node.contact.corner, node.local), row.value);
+  if constexpr (Obstacles) {
+    if (row.mass != T(0)) row.value = node.contact.after(a.contact, node.local, row.value);
+  }
   if (a.watched && goes_far(a.update, node.there, row)) atomicOr(&a.watched->lost, Displacement::kLost);
   a.update.updated[node.row()] = row;
   if (a.emptied) NodeRows<T, D>::empty(a.emptied, node.row(), a.fixed);

@@ -417,10 +417,12 @@ Substeps<T, D>::Substeps(const SubstepsInputs& inputs) : in(inputs) {
   }
   obstacles = has(in.obstacle_table);
   STD_TORCH_CHECK(!obstacles || has(in.obstacle_data), "obstacles need data");
-  if (obstacles)
+  if (obstacles) {
     contact = obstacle_arguments<T, D>(x, in.lattice, *in.obstacle_table, in.obstacle_data.value(), in.shape, in.sizes,
                                        in.contact_kind, in.obstacle_scene, in.start, in.end, {}, in.time, in.n);
-  if (obstacles) check_scenes(contact, in.scenes);
+    set_walls(contact, in.wall_kind, in.wall_plane);
+    check_scenes(contact, in.scenes);
+  }
   STD_TORCH_CHECK(has(in.scene_dt) == has(in.scene_time), "scene_dt must be given with scene_time");
   if (has(in.scene_dt)) {
     const auto type = x.scalar_type();
@@ -504,8 +506,9 @@ void Substeps<T, D>::use_pool() {
   update.table = topology.table;
   update.nodes = static_cast<const NodeRow<T, D>*>(pool.nodes.data_ptr());
   update.updated = static_cast<NodeRow<T, D>*>(pool.updated.data_ptr());
-  contact.velocity = static_cast<const T*>(pool.updated.data_ptr()) + 1;
-  contact.stride = 1 + D;
+  contact.mass = static_cast<const T*>(pool.updated.data_ptr());
+  contact.velocity = contact.mass + 1;
+  contact.stride = contact.mass_stride = 1 + D;
   if (pool.velocity.defined()) contact.result = static_cast<T*>(pool.velocity.data_ptr());
   advance.gather.nodes = {velocities()->value.e, 1 + D, D};
 }

@@ -71,8 +71,9 @@ MPM_HD T obstacle_speed(const ContactArguments<T, D>& a, const Vector<T, D>& x, 
     const ObstacleRow<T, D>& row = a.row[(a.rows == 1 ? 0 : scene) * int64_t(a.obstacles) + k];
     const ObstaclePose<T, D> pose = obstacle_pose(a, a.kind[k], row, scene);
     if (!pose.acts) continue;
-    const Touch<T, D> t = touch(a, pose, x);
-    const T speed = t.touching ? length(t.surface_velocity) : T(0);
+    Vector<T, D> normal;
+    const bool touching = surface(pose, to_body(pose, x), normal) <= a.rounding;
+    const T speed = touching ? length(velocity_at(pose, x)) : T(0);
     fastest = speed > fastest ? speed : fastest;
   }
   return fastest;

@@ -1,5 +1,6 @@
 """Surfaces that are held at a temperature: where they seem to lie, orders of convergence, gradients, bad input."""
 
+import itertools
 import math
 import warnings
 
@@ -10,7 +11,7 @@ from helpers import relative_error
 
 import torch_mpm as mpm
 from benchmarks.accuracy.heat_fronts import between_surfaces, lag
-from torch_mpm.heat.boundaries import FixedSurface, Flux, HeatNodes, Surface
+from torch_mpm.heat.boundaries import Fixed, FixedSurface, Flux, HeatNodes, Surface
 from torch_mpm.heat.fronts import LAG, LEAST_LAG
 from torch_mpm.ops import heat_operator, scatter
 
@@ -248,3 +249,31 @@ def test_steps_that_are_too_long_for_a_front_are_reported(device):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         heat.check()
+
+
+@pytest.mark.parametrize("kind", [FixedSurface, Fixed])
+@pytest.mark.parametrize("lap", [0.0, 0.15])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_floor_of_several_boxes_is_held_as_one(kind, lap, dim):
+    """Their inner faces, and the edges of their seams, are no surfaces, in any order of the boxes."""
+    dx = 0.1
+    rest = (0.0,) * (dim - 2)
+    state = mpm.State.at_rest(mpm.seed.box((-0.5, 0.0, *rest), (0.5, 0.4, *[0.3] * (dim - 2)), dx), 1.0, dtype=FLOAT)
+    state = state.replace(temperature=torch.zeros_like(state.mass))
+    grid = mpm.Grid(dx, (-1.0, -0.5, *[-0.5] * (dim - 2)), (1.0,) * dim)
+
+    def warmed(ends):
+        parts = [
+            mpm.Box(((a + b) / 2, -0.2, *[0.15] * (dim - 2)), (b - a + 2 * lap, 0.4, *[2.0] * (dim - 2)))
+            for a, b in itertools.pairwise(ends)
+        ]
+        found = []
+        for order in (parts, parts[::-1]):
+            heat = mpm.Heat(grid, 1.0, 1.0, [kind(part, 1.0) for part in order], method="multigrid", tolerance=1e-10)
+            found.append(mpm.rollout(heat, state, 2, 0.02).temperature)
+        torch.testing.assert_close(found[0], found[1])
+        return found[0]
+
+    whole = warmed([-2.0, 2.0])
+    assert 0.1 < float(whole.mean()) < 0.9
+    torch.testing.assert_close(warmed([-2.0, -0.13, 0.21, 2.0]), whole)

@@ -50,7 +50,7 @@ def felt(shape, kind, friction, dim):
 
 
 @pytest.mark.parametrize("kinds", [("slip", "sticky"), ("separate", "slip"), ("sticky", "separate")])
-def test_gradients_of_two_obstacles_at_a_node(kinds, device):
+def test_gradients_of_two_obstacles_that_overlap(kinds, device):
     grid, values, weigh = weighed(device, 2)
 
     def loss(p):
@@ -58,9 +58,8 @@ def test_gradients_of_two_obstacles_at_a_node(kinds, device):
         return weigh(run(grid, values, walls="slip", boundaries=[obstacle("box", p, kinds[0]), ball])[1])
 
     p = parameters(2, device)
-    p["at"], p["speed"] = p["position"] + 0.05, -0.5 * p["velocity"]
-    assert float((p["at"] - p["position"]).norm()) < 0.1  # both hold the node between them
-    check(loss, p, ("position", "velocity") if kinds[0] == "sticky" else ("position", "velocity", "speed"))
+    p["at"], p["speed"] = p["position"] - 0.12, -0.5 * p["velocity"]  # both bound the block from above
+    check(loss, p, ("position", "velocity", "speed"))
 
 
 @pytest.mark.parametrize("stress_form", ["mls", "gradient"])

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from torch_mpm.boundaries.solid import SolidNodes, after_contact
+
 from .grid_update import grid_update
 
 if TYPE_CHECKING:
@@ -46,10 +48,9 @@ def wall_impulses(
 def contact_impulses(
     blocks: Topology, velocity: Tensor, mass: Tensor, obstacles: Sequence[Any], time: float | Tensor
 ) -> Tensor:
-    """[B, K, D + 1 or 3], from `Obstacle.apply` of one obstacle after another."""
-    positions, scene, found = blocks.node_positions(velocity.dtype), blocks.node_scene(), []
-    for obstacle in obstacles:
-        after = obstacle.apply(velocity, positions, scene if blocks.scenes > 1 else None, time, 0.0)
-        found.append(moments(blocks, mass[:, None] * (velocity - after)))
-        velocity = after
-    return torch.stack(found, 1)
+    """[B, K, D + 1 or 3], from the changes of velocity by each obstacle of the solid."""
+    positions = blocks.node_positions(velocity.dtype)
+    scene = blocks.node_scene() if blocks.scenes > 1 else None
+    acts = [blocks.active_nodes()] * len(obstacles)
+    _, changes = after_contact(velocity, SolidNodes(obstacles, acts, positions, scene, time, blocks.grid.dx))
+    return torch.stack([moments(blocks, -mass[:, None] * change) for change in changes], 1)

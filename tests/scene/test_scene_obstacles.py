@@ -8,7 +8,7 @@ pytest.importorskip("pydantic")
 from helpers import TOLERANCE, relative_error
 
 from torch_mpm import rollout
-from torch_mpm.scene import Scene
+from torch_mpm.scene import Scene, SceneError
 
 BASE = {
     "grid": {"lower": (0, 0), "upper": (1, 1), "dx": 0.05},
@@ -64,3 +64,20 @@ def test_held_temperatures_of_a_batch():
         end = rollout(built.step, built.state, 40, 1e-3)
     means = [float(end.temperature[end.scene == k].mean()) for k in range(3)]
     assert abs(means[0]) < 1e-3 and means[1] > 1.0 and abs(means[2]) < 1e-3
+
+
+def test_particles_seeded_inside_obstacles_are_refused_or_moved_and_counted():
+    """A block that reaches dx/2 into a floor in the second of three scenes."""
+    block = {"shape": "box", "lower": (0.3, 0.225), "upper": (0.7, 0.4), "material": "jelly"}
+    floor = {"shape": "box", "center": (0.5, 0.0), "size": (2.0, 0.5)}
+    scenes = [{"body": [block]}, {"body": [block], "obstacle": [floor]}]
+    scenes.append({"body": [{**block, "lower": (0.3, 0.25)}], "obstacle": [floor]})
+    with pytest.raises(SceneError, match=r"are inside scene.1.*or set project = true"):
+        Scene(**BASE, scene=scenes).build("cpu")
+    free = Scene(**BASE, scene=[{"body": scene["body"]} for scene in scenes]).build("cpu").state
+    inside = (free.x[:, 1] < 0.25) & (free.scene == 1)
+    moved = Scene(**BASE, scene=scenes, project=True).build("cpu")
+    assert moved.projected.tolist() == [0, int(inside.sum()), 0] and bool(inside.any())
+    expected = free.x.clone()
+    expected[inside, 1] = 0.25
+    torch.testing.assert_close(moved.state.x, expected)

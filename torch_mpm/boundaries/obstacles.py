@@ -17,8 +17,8 @@ from ..geometry import shapes
 from ..geometry.per_scene import Value, finite, per_node
 from ..geometry.shapes import Shape
 from ..geometry.vectors import transform
-from .contact import contact_change
 from .motion import Path, Pose, RigidMotion, to_body
+from .solid import SolidNodes, after_contact
 from .walls import CONTACTS
 
 if TYPE_CHECKING:
@@ -52,7 +52,9 @@ class Obstacle(RigidMotion):
 
     At a node inside, the velocity relative to the surface there loses all of itself ("sticky"), its normal component
     ("slip"), or its normal component where it points into the body ("separate"). Coulomb friction then lowers the
-    tangential speed by `friction` times the normal velocity that was stopped. A vibrating body needs more friction to
+    tangential speed by `friction` times the normal velocity that was stopped. In an inner edge or corner the node meets
+    all faces that join there, and obstacles of a step act as one solid (docs/concepts.md). `forward` is that of the
+    obstacle alone. A vibrating body needs more friction to
     stick than a rigid one (docs/limitations.md).
 
     Args:
@@ -218,34 +220,50 @@ class Obstacle(RigidMotion):
                 "velocity and positions must both have shape [N, D], "
                 f"got {shape_of(velocity)} and {shape_of(positions)}"
             )
-        contact = self.contact_at(positions, scene, time)
-        if contact is None:
-            return velocity
-        touching, normal, surface_velocity = contact
-        touching = touching[:, None]
-        friction = self.friction
-        if isinstance(friction, Tensor):
-            friction = self.at_nodes("friction", velocity, (), scene)[..., None]
-        # Zero velocity stays zero; a NaN outside does not reach the gradient of the parameters.
-        relative = torch.where(touching, velocity if surface_velocity is None else velocity - surface_velocity, 0)
-        return velocity + contact_change(relative, normal, self.kind, friction)
-
-    def contact_at(
-        self, positions: Tensor, scene: Tensor | None, time: float | Tensor
-    ) -> tuple[Tensor, Tensor, Tensor | None] | None:
-        """What nodes meet: which of them touch, bool [N]; the outward normals [N, D]; and the velocity of the surface
-        [N, D] or [D] [m/s], None at rest. None where the obstacle is not there. Arguments as `forward`.
-
-        Raises:
-            ValueError: for wrong shapes or devices.
-        """
         if positions.shape[0] == 0 or self._absent(scene, time):
-            return None
-        arm, turn = self._arm_and_turn(positions, scene, time)
+            return velocity
+        after, _ = after_contact(velocity, SolidNodes([self], [None], positions, scene, time, None))
+        return after
+
+    # -- surfaces, as contact of several obstacles looks at them
+
+    def surface_at(self, x: Tensor, scene: Tensor | None, time: float | Tensor) -> tuple[Tensor, Tensor]:
+        """Signed distance [N] [m] and outward normal [N, D] at points of the world; other arguments as `forward`."""
+        arm, turn = self._arm_and_turn(x, scene, time)
         distance, normal = self.shape.surface(to_body(turn, arm), scene)
-        if turn is not None:
-            normal = transform(turn, normal)
-        return self._touching(distance, positions, scene, time), normal, self.velocity_at(arm, scene, time)
+        return distance, normal if turn is None else transform(turn, normal)
+
+    def faces_at(self, x: Tensor, scene: Tensor | None, time: float | Tensor) -> shapes.Faces | None:
+        """`Shape.surface_faces` at points of the world."""
+        if type(self.shape).surface_faces is Shape.surface_faces:
+            return None
+        arm, turn = self._arm_and_turn(x, scene, time)
+        found = self.shape.surface_faces(to_body(turn, arm), scene)
+        if found is None or turn is None:
+            return found
+        return found._replace(normal=found.normal @ turn.mT)
+
+    def height_of_face(
+        self, x: Tensor, face: Tensor, scene: Tensor | None, time: float | Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Height of points above a face of each, int64 [N], and the normal there; −1 for the whole surface."""
+        height, normal = self.surface_at(x, scene, time)
+        found = self.faces_at(x, scene, time)
+        if found is None or found.height.shape[1] == 1:
+            return height, normal
+        index = face.clamp(0, found.height.shape[1] - 1)[:, None]
+        own = found.normal.gather(1, index[:, :, None].expand(-1, 1, x.shape[1]))[:, 0]
+        whole = face < 0
+        return torch.where(whole, height, found.height.gather(1, index)[:, 0]), torch.where(whole[:, None], normal, own)
+
+    def turned(self, body: Tensor, scene: Tensor | None, time: float | Tensor) -> Tensor:
+        """Vectors of the body [N, D] in the world."""
+        turn = self.rotation_at(time, body, body.shape[1])
+        return body if turn is None else transform(per_node(turn, 2, scene), body)
+
+    def matter_velocity(self, x: Tensor, scene: Tensor | None, time: float | Tensor) -> Tensor | None:
+        """Velocity of the body's matter at points of the world [N, D] or [D] [m/s]; None at rest."""
+        return self.velocity_at(x - per_node(self.centre_at(time, x), 1, scene), scene, time)
 
     def _arm_and_turn(
         self, positions: Tensor, scene: Tensor | None, time: float | Tensor
@@ -415,8 +433,8 @@ class Capsule(Obstacle):
 class Revolved(Obstacle):
     """A polygon turned about an axis: a cone, a tube, a funnel, an hourglass, a drum.
 
-    In 2-D, the polygon and its mirror image. A wall should be at least 4 cells thick, and reach 3 cells beyond the
-    domain where it meets one of its faces: nodes outside carry momentum too.
+    In 2-D, the polygon and its mirror image. A wall should be at least 4 cells thick, and reach 3 cells beyond an open
+    face of the domain where it meets one: nodes outside carry momentum too.
 
     Args:
         outline: corners of the polygon, K pairs of distance from the axis (≥ 0) and position along it [m], counted from

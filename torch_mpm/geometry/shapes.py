@@ -25,7 +25,7 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -49,6 +49,22 @@ UNLIKE = 1e-3
 """Relative difference between the volume inside a mesh and that by its normals from which on it is reported."""
 
 
+class Faces(NamedTuple):
+    """Faces of a shape as points see them.
+
+    Attributes:
+        height: of the points above the surface that carries each face [N, F] [m], negative inside.
+        normal: unit normals of these, out of the shape [N, F, D].
+        beyond: about how far the foot of each point is from the face itself [N, F] [m].
+        flat: whether heights are linear in the position.
+    """
+
+    height: Tensor
+    normal: Tensor
+    beyond: Tensor
+    flat: bool
+
+
 class Shape(SceneParameters):
     """Closed region. Base class of all shapes; only `surface` must be defined.
 
@@ -70,6 +86,14 @@ class Shape(SceneParameters):
             scene: scene of each point, int [N] (negative: none), or None for one scene.
         """
         raise NotImplementedError
+
+    def surface_faces(self, x: Tensor, scene: Tensor | None = None) -> Faces | None:
+        """The faces of the surface one by one, where they are known; None where `surface` is all there is.
+
+        Contact of nodes at inner edges and at the seams of several obstacles looks at faces; those of other shapes are
+        found from `surface` around a node. Arguments as `surface`.
+        """
+        return None
 
     def signed_distance(self, x: Tensor, scene: Tensor | None = None) -> Tensor:
         """Signed distance of `surface` alone [N] [m]."""
@@ -114,6 +138,9 @@ class Plane(Shape):
         normal = unit(self.at_nodes("normal", x, x.shape[1:], scene))
         return (x * normal).sum(1), normal.expand_as(x)
 
+    def surface_faces(self, x: Tensor, scene: Tensor | None = None) -> Faces:
+        return _one_face(*self.surface(x, scene), True)
+
     def volume(self, dim: int, scene: int = 0) -> float:
         return math.inf
 
@@ -142,6 +169,9 @@ class Sphere(Shape):
 
     def surface(self, x: Tensor, scene: Tensor | None = None) -> tuple[Tensor, Tensor]:
         return self.signed_distance(x, scene), unit(x)
+
+    def surface_faces(self, x: Tensor, scene: Tensor | None = None) -> Faces:
+        return _one_face(*self.surface(x, scene), False)
 
     def signed_distance(self, x: Tensor, scene: Tensor | None = None) -> Tensor:
         return norm(x) - self.at_nodes("radius", x, (), scene)
@@ -177,6 +207,14 @@ class Box(Shape):
         depth = self._depth(x, scene)
         nearest = torch.arange(x.shape[1], device=x.device) == depth.argmax(1, keepdim=True)
         return self._distance(depth), nearest * torch.where(x < 0, -1, 1).to(x.dtype)
+
+    def surface_faces(self, x: Tensor, scene: Tensor | None = None) -> Faces:
+        """The lower and the upper one of each axis in turn."""
+        half = 0.5 * self.at_nodes("size", x, x.shape[1:], scene)
+        height = torch.stack([-x - half, x - half], 2).flatten(1)
+        axes = torch.eye(x.shape[1], dtype=x.dtype, device=x.device)
+        normal = torch.stack([-axes, axes], 1).flatten(0, 1)
+        return Faces(height, normal.expand(len(x), -1, -1), torch.zeros_like(height), True)
 
     def signed_distance(self, x: Tensor, scene: Tensor | None = None) -> Tensor:
         size = self.at_nodes("size", x, x.shape[1:], scene)
@@ -222,6 +260,9 @@ class Capsule(Shape):
     def surface(self, x: Tensor, scene: Tensor | None = None) -> tuple[Tensor, Tensor]:
         offset = self._offset(x, scene)
         return self._distance(offset, scene), unit(offset)
+
+    def surface_faces(self, x: Tensor, scene: Tensor | None = None) -> Faces:
+        return _one_face(*self.surface(x, scene), False)
 
     def signed_distance(self, x: Tensor, scene: Tensor | None = None) -> Tensor:
         return self._distance(self._offset(x, scene), scene)
@@ -270,14 +311,32 @@ class Revolved(Shape):
 
     def surface(self, x: Tensor, scene: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """The normal is that of the nearest edge of the polygon, also where a reentrant corner is nearest."""
+        axis, along, across = self._split(x, scene)
+        distance, normal = self._polygon(torch.cat([norm(across)[:, None], along], 1))
+        return distance, normal[:, :1] * unit(across) + normal[:, 1:] * axis
+
+    def surface_faces(self, x: Tensor, scene: Tensor | None = None) -> Faces:
+        """One of each edge of the polygon; those on the axis, which are inside the body, are infinitely high."""
+        axis, along, across = self._split(x, scene)
+        a = self.parameter("outline", x, (len(self.outline), 2))
+        edge = a.roll(-1, 0) - a
+        size = norm(edge)
+        arm = torch.cat([norm(across)[:, None], along], 1)[:, None] - a
+        plane = unit(torch.stack([edge[:, 1], -edge[:, 0]], 1))
+        on_axis = ((a[:, 0] == 0) & (edge[:, 0] == 0)) | (size == 0)
+        height = torch.where(on_axis, torch.inf, (arm * plane).sum(2))
+        foot = (arm * edge).sum(2) / torch.where(size > 0, size, 1)
+        normal = plane[:, :1] * unit(across)[:, None] + plane[:, 1:] * axis.expand_as(x)[:, None]
+        return Faces(height, normal, torch.maximum(-foot, foot - size).clamp_min(0), x.shape[1] == 2)
+
+    def _split(self, x: Tensor, scene: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+        """The axis [D] or [N, D], positions along it [N, 1], and the rest of x [N, D]."""
         if self.axis is None:
             axis = torch.eye(x.shape[1], dtype=x.dtype, device=x.device)[1]
         else:
             axis = unit(self.at_nodes("axis", x, x.shape[1:], scene))
         along = (x * axis).sum(1, keepdim=True)
-        across = x - along * axis
-        distance, normal = self._polygon(torch.cat([norm(across)[:, None], along], 1))
-        return distance, normal[:, :1] * unit(across) + normal[:, 1:] * axis
+        return axis, along, x - along * axis
 
     def _polygon(self, p: Tensor) -> tuple[Tensor, Tensor]:
         """Signed distance [N] of points [N, 2] from the polygon, and outward normal [N, 2] of the nearest edge."""
@@ -433,7 +492,7 @@ class Mesh(Shape):
 class Terrain(Mesh):
     """Ground below an open height surface, or space above it; 3-D only.
 
-    Vertical sides and a flat face close it. As an obstacle it should extend 3 cells beyond the domain.
+    Vertical sides and a flat face close it. As an obstacle it should extend 3 cells beyond open faces of the domain.
     `Sampled.of(terrain, lower, upper, spacing)`, with corners outside the closed body, acts in the kernel.
 
     Args:
@@ -506,7 +565,7 @@ class SDF(Shape):
         if self.normal is not None:
             distance, normal = self.distance(x), self.normal(x)
         else:
-            distance, normal = _with_gradient(self.distance, x)
+            distance, normal = with_gradient(self.distance, x)
         self._check(distance, normal, x)
         return distance, unit(normal)
 
@@ -584,7 +643,7 @@ class Sampled(Shape):
         along = (x - x.new_tensor(self.lower)) / self.spacing
         last = x.new_tensor([n - 1 for n in counts])
         inside = torch.minimum(along.clamp_min(0), last)
-        cell = torch.minimum(inside.detach().floor(), last - 1).long()
+        cell = torch.minimum(inside.detach().nan_to_num().floor(), last - 1).long()
         weight = inside - cell
         distance, gradient = torch.zeros_like(x[:, 0]), [torch.zeros_like(x[:, 0]) for _ in counts]
         for corner in itertools.product((0, 1), repeat=len(counts)):
@@ -619,6 +678,11 @@ def _steepest(values: Tensor) -> float:
             ends = tuple(slice(max(0, s), n - max(0, -s)) for s, n in zip(step, values.shape, strict=True))
             most = max(most, float((values[ends] - values[starts]).abs().max()) / math.hypot(*step))
     return most
+
+
+def _one_face(height: Tensor, normal: Tensor, flat: bool) -> Faces:
+    """A surface that is one face."""
+    return Faces(height[:, None], normal[:, None], torch.zeros_like(height)[:, None], flat)
 
 
 def ball_volume(dim: int, radius: float) -> float:
@@ -665,7 +729,7 @@ def _nearest_of_all(x: Tensor, corners: Tensor) -> Tensor:
     return candidates[torch.arange(len(x), device=x.device), nearest]
 
 
-def _with_gradient(function: Callable[[Tensor], Tensor], points: Tensor) -> tuple[Tensor, Tensor]:
+def with_gradient(function: Callable[[Tensor], Tensor], points: Tensor) -> tuple[Tensor, Tensor]:
     """Values [N] of a function of points [N, D], each depending on its own point, and their gradients;
     differentiable.
     """

@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -20,6 +20,8 @@ from torch import Tensor
 from ..boundaries import Obstacle
 from ..errors import NUMBER_OR_TENSOR, check_number, check_real, shape_of
 from ..geometry.per_scene import per_node
+from ..geometry.shapes import with_gradient
+from ..geometry.vectors import unit
 from ..grid.bspline import base_node, bspline
 from ..grid.grid import Blocks
 from ..grid.topology import PADDING
@@ -63,6 +65,7 @@ class HeatNodes:
         fixed: nodes whose temperature is held at `held` [N] [K], bool [N], or None.
         share: remaining fraction of the conductivity of particles [P], or None for all of it.
         layers: exchange that replaces the rest, see `add_layer`.
+        held_surfaces: obstacles of all `FixedSurface` of the step, in their order.
     """
 
     blocks: Blocks
@@ -78,6 +81,7 @@ class HeatNodes:
     held: Tensor | None = None
     share: Tensor | None = None
     layers: list[tuple[Tensor, Number]] = dataclasses.field(default_factory=list)
+    held_surfaces: Sequence[Obstacle] = ()
 
     @property
     def time(self) -> float | Tensor:
@@ -91,6 +95,20 @@ class HeatNodes:
         nothing, gradient = pointwise("surface_normals", dim, self.volume)
         (area,) = pointwise("length", dim, scatter(self.blocks, self.state.x, nothing, gradient=gradient))
         return area
+
+    @functools.cached_property
+    def feet_on_held_surfaces(self) -> list[Tensor]:
+        """The points of each of `held_surfaces` that are nearest to the particles [P, D] [m]; without gradient."""
+        x = self.state.x.detach()
+
+        def foot(region: Obstacle) -> Tensor:
+            def distance(points: Tensor) -> Tensor:
+                return region.signed_distance(points, self.state.scene, self.time)
+
+            away, gradient = with_gradient(distance, x)
+            return (x - away[:, None] * unit(gradient)).detach()
+
+        return [foot(region) for region in self.held_surfaces]
 
     def scene(self) -> Tensor | None:
         """Scene of each node, int32 [N]; None for one scene."""
@@ -394,7 +412,8 @@ class FixedSurface(Term):
     change over 0.042 dx with 4 or 9 particles per cell, 0.22 dx with one, for any position of the surface between the
     nodes. In the mean it matches that of the surface within 0.02 dx, and within 0.1 dx with a gap of 0.5 dx to the
     matter. With FLIP the error is 1.2 dx, because nothing smooths the particles (benchmarks/results/heat_fronts.md).
-    Matter inside the obstacle is held as at the surface.
+    Matter inside the obstacle is held as at the surface. Several such regions act as one: a region has no surface where
+    its nearest point lies on another one, as at the seam of two boxes.
 
     Args:
         region: an obstacle of `torch_mpm.boundaries`, wherever it moves.
@@ -418,8 +437,29 @@ class FixedSurface(Term):
         width, state = self.WIDTH * nodes.blocks.grid.dx, nodes.state
         self.region.check_scenes(nodes.blocks.grid.dim, nodes.blocks.grid.scenes)
         distance = self.region.signed_distance(state.x, state.scene, nodes.time).to(state.x)
+        covered = self._covered(nodes, distance)
+        if covered is not None:
+            distance = torch.where(covered, 2 * width, distance)
         share, rate = pointwise("heat_layer", nodes.blocks.grid.dim, distance, width)
         nodes.add_layer(share, rate, nodes.per_node(self.temperature, "temperature"))
+
+    def _covered(self, nodes: HeatNodes, distance: Tensor) -> Tensor | None:
+        """Particles outside whose nearest point of the region lies on or in another held one, bool [P]. Where the
+        nearest points of two regions are one, that of the first counts. None where there is no other region."""
+        regions = list(nodes.held_surfaces)
+        if len(regions) < 2:
+            return None
+        mine = next(k for k, region in enumerate(regions) if region is self.region)
+        feet, scene, time = nodes.feet_on_held_surfaces, nodes.state.scene, nodes.time
+        with torch.no_grad():
+            near = 1e-4 * nodes.blocks.grid.dx
+            covered = torch.zeros_like(distance, dtype=torch.bool)
+            for k, region in enumerate(regions):
+                if k != mine:
+                    same = (feet[k] - feet[mine]).norm(dim=1) <= near
+                    on = region.signed_distance(feet[mine], scene, time) <= near
+                    covered |= on & ~same if mine < k else on
+        return covered & (distance > 0)
 
 
 class Source(Term):

@@ -239,6 +239,7 @@ class Heat(nn.Module):
         (total, *_), means = _averages(blocks, state.x, weights, theta, gradient)
         smooth = means[-1]
         nodes = HeatNodes(blocks, state, volume, conductance, total, means[0], self.reference)
+        nodes.held_surfaces = [b.region for b in self.boundaries if isinstance(b, FixedSurface)]
         for boundary in self.boundaries:
             boundary.apply(nodes)
         if self.plastic_heating and dissipated is not None:

@@ -11,10 +11,11 @@ import torch
 from torch import Tensor
 
 from ..boundaries import Obstacle, Walls
+from ..boundaries.constraints import KINDS
+from ..boundaries.solid import Meeting, SolidNodes, find_surfaces
 from ..boundaries.walls import Face
 from ..geometry.vectors import product
 from ..grid.grid import Blocks
-from .mirrors import reflected_inside
 
 ON_FACE = 1e-6
 """Share of dx within which a node is at a wall, as the grid update has it."""
@@ -35,6 +36,8 @@ class NodeBounds:
         surface: velocity of the surface that rubs a node, in its axes [N, D] [m/s]; with friction alone.
         crossable: whether there may be bounds that a step can cross, or friction: the components that are held are then
             a part of what a step must find.
+        tilt: what the direction of a component's bound has beside its axis [N, D, D]: zero, but its derivative is not;
+            None where no gradient of it is wanted.
         owner: what bounds a component, int32 [N, D]: the number of an obstacle, or that of a face after them; -1 for
             nothing. None where nobody asks.
     """
@@ -46,6 +49,7 @@ class NodeBounds:
     surface: Tensor | None = None
     owner: Tensor | None = None
     crossable: bool = False
+    tilt: Tensor | None = None
 
     def detached(self) -> NodeBounds:
         """The same, detached."""
@@ -57,7 +61,7 @@ class NodeBounds:
 
     def moves(self) -> bool:
         """Whether a gradient is wanted of where the surfaces are and how they move."""
-        parts = (self.lower, self.upper, self.mirror, self.surface)
+        parts = (self.lower, self.upper, self.mirror, self.surface, self.tilt)
         return any(part is not None and part.requires_grad for part in parts)
 
     def turned(self, v: Tensor) -> Tensor:
@@ -120,8 +124,9 @@ def node_bounds(
 ) -> NodeBounds | None:
     """The bounds that walls and obstacles set; None without any.
 
-    Of several obstacles at a node, one that is sticky counts, otherwise the first. Where walls and an obstacle rub a
-    node, its velocity relative to the obstacle counts.
+    Obstacles act as one solid (csrc/grid/solid.h). Of the surfaces of an inner edge that are both oblique to the
+    lattice, in 3-D, the second counts along the nearest axis beside the first. Where several surfaces rub a node, its
+    velocity relative to the last obstacle that does counts.
 
     Args:
         blocks: the active blocks.
@@ -151,12 +156,8 @@ def node_bounds(
         bounds.owner = torch.full(positions.shape, -1, dtype=torch.int32, device=positions.device)
     if walls is not None:
         _add_walls(bounds, blocks, faces, positions, len(obstacles))
-    scene = blocks.node_scene() if blocks.grid.scenes > 1 else None
-    sign: Tensor | None = None
-    if obstacles and any(f.kind == "mirror" for f in faces):
-        positions, sign = reflected_inside(faces, positions)
-    for number, obstacle in enumerate(obstacles):
-        _add_obstacle(bounds, obstacle, number, positions, sign, scene, blocks.grid.scenes, time)
+    if obstacles:
+        _add_obstacles(bounds, blocks, faces, obstacles, positions, time)
     return bounds
 
 
@@ -191,59 +192,134 @@ def _add_walls(bounds: NodeBounds, blocks: Blocks, faces: Sequence[Face], positi
             bounds.friction[:, axis].masked_fill_(touching, -face.friction if above else face.friction)
 
 
-def _add_obstacle(
+def _add_obstacles(
     bounds: NodeBounds,
-    obstacle: Any,
-    number: int,
+    blocks: Blocks,
+    faces: Sequence[Face],
+    obstacles: list[Any],
     positions: Tensor,
-    sign: Tensor | None,
-    scene: Tensor | None,
-    scenes: int,
     time: float | Tensor,
 ) -> None:
-    if not isinstance(obstacle, Obstacle):
-        raise NotImplementedError(
-            f"an implicit step takes obstacles alone as boundaries, got {type(obstacle).__name__}"
+    """All obstacles as one solid: what is sticky first, then surfaces along the axes, then others."""
+    for obstacle in obstacles:
+        if not isinstance(obstacle, Obstacle):
+            raise NotImplementedError(
+                f"an implicit step takes obstacles alone as boundaries, got {type(obstacle).__name__}"
+            )
+        obstacle.check_scenes(positions.shape[1], blocks.grid.scenes)
+    scene = blocks.node_scene() if blocks.grid.scenes > 1 else None
+    acts = [blocks.active_nodes()] * len(obstacles)
+    meeting = find_surfaces(SolidNodes(obstacles, acts, positions, scene, time, blocks.grid.dx, faces))
+    if meeting is None:
+        return
+    surfaces = [_Surface.of(meeting, k, len(positions)) for k in range(positions.shape[1])]
+    for surface in surfaces:
+        _add_sticky(bounds, surface)
+    for surface in surfaces:
+        _add_along_axis(bounds, surface)
+    for surface in surfaces:
+        _add_oblique(bounds, surface)
+
+
+@dataclasses.dataclass
+class _Surface:
+    """One of the surfaces that each node meets.
+
+    Attributes:
+        there: bool [N, 1].
+        alone: whether it is the only one, bool [N, 1].
+        owner: int32 [N, 1].
+        kind: a number of `KINDS` [N, 1].
+        friction: [N, 1].
+        normal, velocity: [N, D].
+    """
+
+    there: Tensor
+    alone: Tensor
+    owner: Tensor
+    kind: Tensor
+    friction: Tensor
+    normal: Tensor
+    velocity: Tensor
+
+    @classmethod
+    def of(cls, meeting: Meeting, k: int, nodes: int) -> _Surface:
+        found = meeting.surface_of(k)
+        columns = (
+            meeting.owner[:, k : k + 1] >= 0,
+            (meeting.owner >= 0).sum(1, keepdim=True) == 1,
+            meeting.owner[:, k : k + 1].to(torch.int32),
+            found.kind[:, None],
+            found.friction[:, None],
+            meeting.sign * found.normal,
+            meeting.sign * found.velocity,
         )
-    obstacle.check_scenes(positions.shape[1], scenes)
-    contact = obstacle.contact_at(positions, scene, time)
-    if contact is None:
-        return
-    touching, normal, surface_velocity = contact
-    surface = torch.zeros_like(positions) if surface_velocity is None else surface_velocity.expand_as(positions)
-    if sign is not None:
-        normal, surface = sign * normal, sign * surface
-    if obstacle.kind == "sticky":
-        rows = touching[:, None] & (bounds.lower != bounds.upper)  # what a wall holds stays
-        surface = bounds.turned(surface)
-        bounds.lower = torch.where(rows, surface, bounds.lower)
-        bounds.upper = torch.where(rows, surface, bounds.upper)
-        if bounds.owner is not None:
-            bounds.owner.masked_fill_(rows, number)
-        return
-    normal = torch.where(bounds.lower.isfinite() | bounds.upper.isfinite(), 0, normal)
-    length = normal.norm(dim=-1, keepdim=True)
-    taken = torch.zeros_like(touching) if bounds.mirror is None else (bounds.mirror != 0).any(-1)
-    rows = (touching & ~taken)[:, None] & (length > 1e-3)
-    normal = normal / torch.where(length > 0, length, 1)
-    axis = torch.nn.functional.one_hot(normal.abs().argmax(-1), positions.shape[1]).to(normal.dtype)
-    side = torch.where((normal * axis).sum(-1, keepdim=True) < 0, -1.0, 1.0).to(normal.dtype)
+        if meeting.nodes is None:
+            return cls(*columns)
+        rows = meeting.nodes
+        return cls(*(column.new_zeros(nodes, column.shape[1]).index_copy(0, rows, column) for column in columns))
+
+
+def _add_sticky(bounds: NodeBounds, surface: _Surface) -> None:
+    rows = surface.there & (surface.kind == KINDS["sticky"]) & (bounds.lower != bounds.upper)  # what a wall holds stays
+    bounds.lower = torch.where(rows, surface.velocity, bounds.lower)
+    bounds.upper = torch.where(rows, surface.velocity, bounds.upper)
+    if bounds.owner is not None:
+        bounds.owner = torch.where(rows, surface.owner, bounds.owner)
+
+
+def _add_along_axis(bounds: NodeBounds, surface: _Surface) -> None:
+    """Of a normal along an axis at a node that meets others: a bound of that component as it is."""
+    normal = surface.normal
+    held = bounds.lower.isfinite() | bounds.upper.isfinite()
+    entry = surface.there & ~surface.alone & (surface.kind != KINDS["sticky"]) & _is_along_axis(normal) & ~held
+    side = normal.detach().sign()
+    if normal.requires_grad:
+        tilt = torch.where(entry[:, :, None], (side[:, :, None] * (normal - normal.detach())[:, None]), 0)
+        bounds.tilt = tilt if bounds.tilt is None else bounds.tilt + tilt
+    _bound(bounds, surface, entry, side, (surface.velocity * normal).sum(-1, keepdim=True))
+
+
+def _is_along_axis(normal: Tensor) -> Tensor:
+    """The axes along which normals are, bool [N, D]."""
+    return normal.detach().abs() > 1 - 1e-6
+
+
+def _add_oblique(bounds: NodeBounds, surface: _Surface) -> None:
+    """Of any other normal: the first is turned to an axis, what others have beside it counts along the nearest one."""
+    normal = surface.normal
+    other = surface.alone | ~_is_along_axis(normal).any(-1, keepdim=True)
+    oblique = surface.there & (surface.kind != KINDS["sticky"]) & other
+    taken = torch.zeros_like(oblique) if bounds.mirror is None else (bounds.mirror != 0).any(-1, keepdim=True)
+    held = bounds.lower.isfinite() | bounds.upper.isfinite()
+    seen = torch.where(held, 0, torch.where(taken, bounds.turned(normal), normal))
+    length = seen.norm(dim=-1, keepdim=True)
+    rows = oblique & (length > 1e-3)
+    seen = seen / torch.where(length > 0, length, 1)
+    axis = torch.nn.functional.one_hot(seen.abs().argmax(-1), seen.shape[1]).to(seen.dtype)
+    side = torch.where((seen * axis).sum(-1, keepdim=True) < 0, -1.0, 1.0).to(seen.dtype)
     # The reflection that takes the axis to −side times the normal, whose difference does not cancel.
-    w = axis * side + normal
+    w = axis * side + seen
     w = w / w.norm(dim=-1, keepdim=True)
     old = torch.zeros_like(w) if bounds.mirror is None else bounds.mirror
-    bounds.mirror = torch.where(rows, w, old)
-    speed = (surface * normal).sum(-1, keepdim=True)
-    limit = torch.where(side > 0, -speed, speed)  # of the component along the axis, u = −side v · n
-    fixed = obstacle.kind == "slip"
-    entry = rows & (axis > 0)
-    bounds.lower = torch.where(entry & ((side < 0) | fixed), limit, torch.where(entry, -math.inf, bounds.lower))
-    bounds.upper = torch.where(entry & ((side > 0) | fixed), limit, torch.where(entry, math.inf, bounds.upper))
+    bounds.mirror = torch.where(rows & ~taken, w, old)
+    velocity = torch.where(taken, bounds.turned(surface.velocity), surface.velocity)
+    speed = (velocity * seen).sum(-1, keepdim=True)
+    _bound(bounds, surface, rows & (axis > 0), torch.where(taken, side, -side), speed)
+
+
+def _bound(bounds: NodeBounds, surface: _Surface, entry: Tensor, side: Tensor, speed: Tensor) -> None:
+    """Bounds of some components, bool [N, D], in the axes of the nodes, by a surface whose normal has the sign `side`
+    along them and a normal velocity `speed` [N, 1]."""
+    limit = side * speed
+    fixed = surface.kind == KINDS["slip"]
+    bounds.lower = torch.where(entry & ((side > 0) | fixed), limit, bounds.lower)
+    bounds.upper = torch.where(entry & ((side < 0) | fixed), limit, bounds.upper)
     if bounds.owner is not None:
-        bounds.owner.masked_fill_(entry, number)
-    if bounds.friction is not None and bounds.surface is not None and rubs(obstacle):
-        friction = obstacle.friction
-        if isinstance(friction, Tensor):
-            friction = obstacle.at_nodes("friction", positions, (), scene)[..., None]
-        bounds.friction = torch.where(entry, -side * friction, bounds.friction)
-        bounds.surface = torch.where(rows, bounds.turned(surface), bounds.surface)
+        bounds.owner = torch.where(entry, surface.owner, bounds.owner)
+    if bounds.friction is None or bounds.surface is None:
+        return
+    rubs_first = (bounds.friction == 0).all(-1, keepdim=True) | (surface.friction.detach() > 0)
+    rubs_here = entry.any(-1, keepdim=True) & rubs_first
+    bounds.friction = torch.where(entry, side * surface.friction, bounds.friction)
+    bounds.surface = torch.where(rubs_here, bounds.turned(surface.velocity), bounds.surface)

@@ -129,7 +129,10 @@ class Contact:
         if self.friction is not None and bounds.surface is not None:
             given = torch.where(self.friction.limit.along & self.friction.sticks, bounds.surface, given)
         holds = self.holds(system)
-        return bounds.turned(torch.where(holds, u - torch.where(holds, given, 0), 0))
+        missed = u - torch.where(holds, given, 0)
+        if bounds.tilt is not None:
+            missed = missed + (bounds.tilt * v[:, None]).sum(2)
+        return bounds.turned(torch.where(holds, missed, 0))
 
 
 def contact_at(system: ImplicitSystem, bounds: NodeBounds | None, v: Tensor, gradient: Tensor) -> Contact:
@@ -140,6 +143,9 @@ def contact_at(system: ImplicitSystem, bounds: NodeBounds | None, v: Tensor, gra
     if bounds is None:
         return Contact(massive, gradient)
     free = massive & bounds.free(v, gradient)
+    if bounds.tilt is not None:
+        held = torch.where(free, 0, bounds.turned(gradient))
+        gradient = gradient - (held[:, :, None] * bounds.tilt).sum(1)
     if bounds.friction is None:
         return Contact(free, bounds.kept(gradient, free))
     friction = _friction(bounds, v, gradient, free, _limit(bounds, gradient, free))

@@ -8,13 +8,11 @@ Hessian and node blocks are those of all nodes, projected onto symmetric ones.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from ..boundaries import Walls
-from ..boundaries.walls import Face
 from ..grid.grid import Blocks
 from ..ops.grid_update_composed import images
 
@@ -96,18 +94,3 @@ def mirrors_of(blocks: Blocks, walls: Walls | None, mass: Tensor) -> Mirrors | N
     groups = torch.where(present, groups, -1)
     first = torch.where(present, groups, len(mass)).amin(1) == own
     return Mirrors(groups[first & present[:, 0] & (present.sum(1) > 1)].to(torch.int32))
-
-
-def reflected_inside(faces: Sequence[Face], positions: Tensor) -> tuple[Tensor, Tensor]:
-    """Positions of nodes [N, D] [m], those of the images for nodes behind mirrors, and the signs of the axes of the
-    latter [N, D].
-    """
-    positions, sign = positions.clone(), torch.ones_like(positions)
-    for number, face in enumerate(faces):
-        axis, above = divmod(number, 2)
-        if face.kind == "mirror":
-            at = positions[:, axis]
-            behind = at > face.plane if above else at < face.plane
-            sign[:, axis].masked_fill_(behind, -1)
-            positions[:, axis] = torch.where(behind, 2 * face.plane - at, at)
-    return positions, sign

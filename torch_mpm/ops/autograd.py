@@ -60,7 +60,7 @@ def register_autograd(
     The tensors of a `topology` are integers: they are passed on in their list, and `save_with_topology` stores them.
 
     Args:
-        name: name of the op.
+        name: name of the op; its arguments with default values come last.
         backward: function (ctx, *grads) that returns the gradients of all arguments; a list of them for a list of
             tensors.
         setup: function (ctx, inputs, output), or None where backward needs nothing.

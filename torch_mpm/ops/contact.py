@@ -12,13 +12,14 @@ it), the samples of a sampled one (lower corner, spacing, numbers along the axes
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from ..boundaries import Obstacle
+from ..boundaries import Face, Obstacle, Walls
+from ..boundaries.solid import SolidNodes, after_contact
 from ..errors import FLOATING, NUMBER_OR_TENSOR, check_number, shape_of
 from ..geometry import shapes
 from ..grid.grid import Blocks, check_blocks
@@ -27,10 +28,19 @@ from ..laws.parameters import has_hooks
 from ..step.clocks import StepTimes
 from .arguments import check_list, differentiate, refuse_vmap, sizes
 from .autograd import dispatch, register_autograd, save_with_topology, saved_with_topology
-from .grid_update import CONTACT_KINDS, CONTACT_NAMES, sum_by_scene_of_blocks
+from .grid_update import CONTACT_KINDS, CONTACT_NAMES, sum_by_scene_of_blocks, wall_arguments
 from .obstacle_tables import KERNEL_SHAPES, size_of_data, tables, tables_over
 
 MAX_OBSTACLES = 64  # of one call, csrc/grid/obstacle.h
+
+
+def is_solid(boundary: Any) -> bool:
+    """Whether a boundary is an obstacle that acts with its neighbours as one solid: one without hooks, and without a
+    `forward` or an `apply` of its own."""
+    kind = type(boundary)
+    if not isinstance(boundary, Obstacle) or kind.forward is not Obstacle.forward or kind.apply is not Obstacle.apply:
+        return False
+    return not has_hooks(boundary)
 
 
 def fusible(obstacle: Any, time: float | Tensor, paths: bool = False) -> bool:
@@ -39,24 +49,30 @@ def fusible(obstacle: Any, time: float | Tensor, paths: bool = False) -> bool:
     A position as a function of time, and a time that requires grad, need `Obstacle.apply`; so does any subclass with a
     `forward` or an `apply` of its own. With `paths`, whether `substeps` does, where such a position may be, too.
     """
-    kind = type(obstacle)
-    if not isinstance(obstacle, Obstacle) or kind.forward is not Obstacle.forward or kind.apply is not Obstacle.apply:
-        return False
-    if type(obstacle.shape) not in KERNEL_SHAPES or (obstacle.follows_path and not paths):
-        return False
-    if has_hooks(obstacle):
+    if not is_solid(obstacle) or type(obstacle.shape) not in KERNEL_SHAPES or (obstacle.follows_path and not paths):
         return False
     return not (isinstance(time, Tensor) and time.requires_grad)
 
 
-def contact(blocks: Blocks, velocity: Tensor, obstacles: Sequence[Obstacle], time: float | Tensor) -> Tensor:
-    """Node velocities after contact with obstacles, one after another: `Obstacle.apply` of each, in one kernel.
+def contact(
+    blocks: Blocks,
+    velocity: Tensor,
+    obstacles: Sequence[Obstacle],
+    time: float | Tensor,
+    walls: Walls | None = None,
+    mass: Tensor | None = None,
+) -> Tensor:
+    """Node velocities after contact with obstacles as one solid, see csrc/grid/solid.h.
 
     Args:
         blocks: active blocks.
         velocity: node velocities [N, D] [m/s].
         obstacles: those for which `fusible` holds.
         time: [s], a number or a tensor [] or [B].
+        walls: of the domain, which the obstacles may reach; the grid update has applied them. None for open faces.
+        mass: of the nodes [N] [kg]; those without mass keep their velocity. None where all have mass.
+
+    More than `MAX_OBSTACLES` act in groups of so many, one after another.
 
     Returns:
         Velocity [N, D] [m/s], a view of rows with stride 1 + D.
@@ -79,6 +95,8 @@ def contact(blocks: Blocks, velocity: Tensor, obstacles: Sequence[Obstacle], tim
             scene_time,
             number,
             *blocks.packed,
+            *walls_beside(walls, blocks.grid),
+            None if mass is None else mass.detach(),
         )
         velocity = rows[:, 1:]
     return velocity
@@ -135,6 +153,11 @@ def time_arguments(time: float | Tensor, like: Tensor, scenes: int) -> tuple[Ten
     return scene_time, 0.0
 
 
+def walls_beside(walls: Walls | None, grid: Any) -> tuple[list[int], list[float]]:
+    """Kind and plane [m] of each face, as the ops take them beside obstacles."""
+    return wall_arguments(walls, grid)[:2]
+
+
 def packed_rows(velocity: Tensor) -> Tensor:
     return velocity if velocity.stride(1) == 1 else velocity.contiguous()
 
@@ -157,34 +180,37 @@ def _backward_fake(grad, wants_rows, velocity, obstacles, *arguments):
 
 
 def _setup(ctx: Any, inputs: Any, output: Any) -> None:
-    velocity, obstacles, data, *kinds, scene_time, time = inputs[:-3]
-    save_with_topology(ctx, (velocity, obstacles, data, scene_time), inputs[-3:], kinds=kinds, time=time)
+    velocity, obstacles, data, *kinds, scene_time, time = inputs[:-6]
+    options = {"kinds": kinds, "time": time, "walls": inputs[-3:-1]}
+    save_with_topology(ctx, (velocity, obstacles, data, scene_time, inputs[-1]), inputs[-6:-3], **options)
 
 
 def _backward(ctx, grad):
-    (velocity, obstacles, data, scene_time), topology = saved_with_topology(ctx)
+    (velocity, obstacles, data, scene_time, mass), topology = saved_with_topology(ctx)
     wants_rows = ctx.needs_input_grad[1]
     grad_velocity, rows = dispatch(
         torch.ops.torch_mpm.contact_backward,
-        *(packed_rows(grad[:, 1:]), wants_rows, velocity, obstacles, data, *ctx.kinds, scene_time, ctx.time, *topology),
+        *(packed_rows(grad[:, 1:]), wants_rows, velocity, obstacles, data, *ctx.kinds, scene_time, ctx.time),
+        *(*topology, *ctx.walls, mass),
     )
     rows = sum_by_scene_of_blocks(rows, Topology.unpack(*topology), obstacles.shape[0]) if wants_rows else None
-    return (grad_velocity[:, 1:], rows) + (None,) * 12
+    return (grad_velocity[:, 1:], rows) + (None,) * 15
 
 
 def _backward_setup(ctx: Any, inputs: Any, output: Any) -> None:
-    grad, wants_rows, velocity, obstacles, data, *kinds, scene_time, time = inputs[:-3]
-    options = {"wants_rows": wants_rows, "kinds": kinds, "time": time}
-    save_with_topology(ctx, (grad, velocity, obstacles, data, scene_time), inputs[-3:], **options)
+    grad, wants_rows, velocity, obstacles, data, *kinds, scene_time, time = inputs[:-6]
+    options = {"wants_rows": wants_rows, "kinds": kinds, "time": time, "walls": inputs[-3:-1]}
+    save_with_topology(ctx, (grad, velocity, obstacles, data, scene_time, inputs[-1]), inputs[-6:-3], **options)
 
 
 def _double_backward(ctx, grad_velocity, grad_rows):
-    (grad, velocity, obstacles, data, scene_time), topology = saved_with_topology(ctx)
+    (grad, velocity, obstacles, data, scene_time, mass), topology = saved_with_topology(ctx)
     blocks = Topology.unpack(*topology)
 
     def adjoint(grad: Tensor, velocity: Tensor, obstacles: Tensor) -> Any:
         def after(velocity: Tensor, rows: Tensor) -> Tensor:
-            return composed_contact(blocks, velocity, rows, data, ctx.kinds, scene_time, ctx.time)
+            table = (rows, data, ctx.kinds, scene_time, ctx.time, ctx.walls)
+            return composed_contact(blocks, velocity, *table, mass)[0]
 
         rows = rows_of_slots(obstacles, blocks)
         both = differentiate(after, [velocity, rows], [grad])
@@ -193,7 +219,7 @@ def _double_backward(ctx, grad_velocity, grad_rows):
 
     given = [grad_velocity[:, 1:], grad_rows] if ctx.wants_rows else [grad_velocity[:, 1:]]
     grads = differentiate(adjoint, [grad, velocity, obstacles], given)
-    return (grads[0], None, *grads[1:]) + (None,) * 12
+    return (grads[0], None, *grads[1:]) + (None,) * 15
 
 
 # ---- the same in torch operations, for second derivatives
@@ -214,28 +240,26 @@ def composed_contact(
     kinds: Sequence[Any],
     scene_time: Tensor | None,
     time: float,
-    see: Callable[[Tensor, Tensor], None] = lambda before, after: None,
-) -> Tensor:
-    """Node velocities [N, D] by `Obstacle.forward` of obstacles with parameters of each slot [slots, K, width].
-
-    `see` is called with the velocities before and after each of them.
-    """
+    walls: tuple[Sequence[int], Sequence[float]],
+    mass: Tensor | None,
+) -> tuple[Tensor, list[Tensor]]:
+    """Node velocities [N, D] after contact with obstacles whose parameters are those of each slot [slots, K, width],
+    and the changes by each obstacle."""
     now: float | Tensor = time
     if scene_time is not None:
         now = scene_time[0] if len(scene_time) == 1 else scene_time[blocks.block_scene().clamp_min(0)]
     positions, node_scene, active = blocks.node_positions(velocity.dtype), blocks.node_scene(), blocks.active_nodes()
+    active = active if mass is None else active & (mass != 0)
     slot = torch.arange(rows.shape[0], device=rows.device).repeat_interleave(blocks.grid.nodes_per_block)
-    first = 0
+    obstacles, acts, first = [], [], 0
     for k, (shape, size, kind, scene, start, end) in enumerate(zip(*kinds, strict=True)):
         parameters = _parameters(rows[:, k], velocity.shape[1])
         form = _shape(shape, parameters.pop("extent"), parameters.pop("radius"), data[first : first + size])
-        obstacle = Obstacle(form, kind=CONTACT_NAMES[kind], start=start, end=end, **parameters)
-        acts = active if scene < 0 else active & (node_scene == scene)
-        before = velocity
-        velocity = torch.where(acts[:, None], obstacle.forward(before, positions, slot, now, 0.0), before)
-        see(before, velocity)
+        obstacles.append(Obstacle(form, kind=CONTACT_NAMES[kind], start=start, end=end, **parameters))
+        acts.append(active if scene < 0 else active & (node_scene == scene))
         first += size
-    return velocity
+    faces = [Face(CONTACT_NAMES[kind], plane, 0.0) for kind, plane in zip(*walls, strict=True)]
+    return after_contact(velocity, SolidNodes(obstacles, acts, positions, slot, now, blocks.grid.dx, faces))
 
 
 def _parameters(row: Tensor, dim: int) -> dict[str, Any]:

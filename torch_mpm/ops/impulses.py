@@ -27,6 +27,7 @@ from .contact import (
     present,
     rows_of_slots,
     time_arguments,
+    walls_beside,
 )
 from .grid_update import check_nodes, register_update, sum_by_scene_of_blocks, update_arguments
 from .grid_update_composed import composed_grid_update
@@ -81,7 +82,12 @@ def wall_impulses(
 
 
 def contact_impulses(
-    blocks: Blocks, velocity: Tensor, mass: Tensor, obstacles: Sequence[Obstacle], time: float | Tensor
+    blocks: Blocks,
+    velocity: Tensor,
+    mass: Tensor,
+    obstacles: Sequence[Obstacle],
+    time: float | Tensor,
+    walls: Walls | None = None,
 ) -> Tensor:
     """Impulses on obstacles in a `contact` with the same arguments, but at most `MAX_OBSTACLES` obstacles.
 
@@ -107,7 +113,7 @@ def contact_impulses(
         torch.ops.torch_mpm.contact_impulses,
         *(mass, packed_rows(velocity)),
         *obstacle_arguments(there, velocity, blocks.grid.scenes),
-        *(scene_time, number, *blocks.packed),
+        *(scene_time, number, *blocks.packed, *walls_beside(walls, blocks.grid)),
     )
     if len(there) == len(obstacles):
         return impulses
@@ -163,8 +169,9 @@ register_update("wall_impulses", _composed_wall_impulses)
 
 
 def _contact_setup(ctx: Any, inputs: Any, output: Any) -> None:
-    mass, velocity, obstacles, data, *kinds, scene_time, time = inputs[:-3]
-    save_with_topology(ctx, (mass, velocity, obstacles, data, scene_time), inputs[-3:], kinds=kinds, time=time)
+    mass, velocity, obstacles, data, *kinds, scene_time, time = inputs[:-5]
+    options = {"kinds": kinds, "time": time, "walls": inputs[-2:]}
+    save_with_topology(ctx, (mass, velocity, obstacles, data, scene_time), inputs[-5:-2], **options)
 
 
 def _contact_backward(ctx, grad):
@@ -172,16 +179,17 @@ def _contact_backward(ctx, grad):
     wants_rows = ctx.needs_input_grad[2]
     nodes, rows = dispatch(
         torch.ops.torch_mpm.contact_impulses_backward,
-        *(grad.contiguous(), wants_rows, mass, velocity, obstacles, data, *ctx.kinds, scene_time, ctx.time, *topology),
+        *(grad.contiguous(), wants_rows, mass, velocity, obstacles, data, *ctx.kinds, scene_time, ctx.time),
+        *(*topology, *ctx.walls),
     )
     rows = sum_by_scene_of_blocks(rows, Topology.unpack(*topology), obstacles.shape[0]) if wants_rows else None
-    return (nodes[:, 0], nodes[:, 1:], rows) + (None,) * 12
+    return (nodes[:, 0], nodes[:, 1:], rows) + (None,) * 14
 
 
 def _contact_backward_setup(ctx: Any, inputs: Any, output: Any) -> None:
-    grad, wants_rows, mass, velocity, obstacles, data, *kinds, scene_time, time = inputs[:-3]
-    options = {"wants_rows": wants_rows, "kinds": kinds, "time": time}
-    save_with_topology(ctx, (grad, mass, velocity, obstacles, data, scene_time), inputs[-3:], **options)
+    grad, wants_rows, mass, velocity, obstacles, data, *kinds, scene_time, time = inputs[:-5]
+    options = {"wants_rows": wants_rows, "kinds": kinds, "time": time, "walls": inputs[-2:]}
+    save_with_topology(ctx, (grad, mass, velocity, obstacles, data, scene_time), inputs[-5:-2], **options)
 
 
 def _contact_double_backward(ctx, grad_nodes, grad_rows):
@@ -190,12 +198,10 @@ def _contact_double_backward(ctx, grad_nodes, grad_rows):
 
     def adjoint(grad: Tensor, mass: Tensor, velocity: Tensor, obstacles: Tensor) -> Any:
         def impulses(mass: Tensor, velocity: Tensor, rows: Tensor) -> Tensor:
-            found: list[Tensor] = []
-            composed_contact(
-                *(blocks, velocity, rows, data, ctx.kinds, scene_time, ctx.time),
-                lambda before, after: found.append(impulse_of_nodes(blocks, mass[:, None] * (before - after))),
+            _, changes = composed_contact(
+                blocks, velocity, rows, data, ctx.kinds, scene_time, ctx.time, ctx.walls, mass
             )
-            return torch.stack(found, 1)
+            return torch.stack([impulse_of_nodes(blocks, -mass[:, None] * change) for change in changes], 1)
 
         inputs = (mass, velocity, rows_of_slots(obstacles, blocks))
         found = differentiate(impulses, inputs, [grad])
@@ -207,7 +213,7 @@ def _contact_double_backward(ctx, grad_nodes, grad_rows):
 
     given = [grad_nodes, grad_rows] if ctx.wants_rows else [grad_nodes]
     grads = differentiate(adjoint, [grad, mass, velocity, obstacles], given)
-    return (grads[0], None, *grads[1:]) + (None,) * 12
+    return (grads[0], None, *grads[1:]) + (None,) * 14
 
 
 register_autograd("contact_impulses", _contact_backward, _contact_setup)

@@ -66,6 +66,8 @@ class Built:
     materials: list[Material]
     nozzles: list[Nozzle]
     scenes: list[str]
+    projected: Tensor | None = None
+    """Particles of each scene that were moved out of obstacles, int64 [B]; None unless the scene wants that."""
 
     def emissions(self) -> list[tuple[float, int]]:
         """(time, nozzle) of every layer, in the order of appearance."""
@@ -156,9 +158,12 @@ def build(scene: Any, device: torch.device) -> Built:
     )
     ids = torch.arange(len(first), device=device)
     state = step.prepare(first.replace(ids=ids))
+    moved = None
+    if scene.project:
+        state, moved = step.project(state)
     _check_fields(scene, state)
     nozzles = [Nozzle(step.prepare(n.layer), n.material, n.times) for n in nozzles]
-    return Built(grid, step, state, torch.cat(material), mixture.materials, nozzles, [e.name for e in entries])
+    return Built(grid, step, state, torch.cat(material), mixture.materials, nozzles, [e.name for e in entries], moved)
 
 
 def _named(key: str, make: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
@@ -331,7 +336,8 @@ def _placed(scene: Any, origin: Sequence[float] | None, entry: Any, problems: li
             found = [check.outside(f"{key}{check.called(body)}", lower, upper, scene.grid, origin)]
         problems += found
         placed.append((key + check.called(body), body, points, shape))
-    problems += _overlaps(placed, [o for o in entry.keyed("obstacle") if _is_good(o[0], problems)])
+    solids = [] if scene.project else [o for o in entry.keyed("obstacle") if _is_good(o[0], problems)]
+    problems += _overlaps(placed, solids)
     return placed
 
 
@@ -459,7 +465,7 @@ def _overlaps(placed: Placed, obstacles: Sequence[tuple[str, Any]]) -> Iterator[
             inside = int((solid.signed_distance(points.x, None, 0.0) < 0).sum())
             if inside:
                 where = f"{path}{check.called(words)}"
-                yield f"{key}: {inside} of its particles are inside {where}; move one of them"
+                yield f"{key}: {inside} of its particles are inside {where}; move one of them, or set project = true"
 
 
 def _boxes_meet(placed: Placed) -> npt.NDArray[Any]:

@@ -515,6 +515,7 @@ class Simulation:
             "largest_cfl": self.totals.largest_cfl,
             "smallest_dt": self.totals.smallest_dt,
             "particles_lost": self.built.particles - len(self.state),
+            **({} if self.built.projected is None else {"particles_projected": self.built.projected.tolist()}),
         }
 
 

@@ -606,6 +606,8 @@ class SceneData(Content):
     """frames per second of simulated time"""
     cfl: Annotated[float, Field(gt=0, le=1)] = 0.5
     """time step as a share of the stability limit"""
+    project: bool = False
+    """move particles that are seeded inside obstacles to the nearest point of their surface, and report how many"""
     dt: Positive | None = None
     """fixed upper bound of the time step [s], instead of cfl"""
     transfer: Literal["apic", "pic", "flip"] = "apic"

@@ -11,9 +11,10 @@ import torch
 from torch import Tensor
 
 from ..boundaries import BoundaryList, Obstacle, Walls
-from ..boundaries.apply import after_boundaries
+from ..boundaries.apply import after_boundaries, project
 from ..boundaries.control import control_step, motions_now
 from ..boundaries.impulses import Impulses, check_impulse, impulses_of, no_impulse
+from ..boundaries.thickness import warn_of_thin_walls
 from ..cuda_graphs.capture import DeviceConstantCache, is_captured, is_traced, is_transformed
 from ..errors import REAL, PrecisionWarning, check_flag, check_number, check_vector, is_finite, shape_of
 from ..grid import resolution
@@ -318,8 +319,9 @@ class Step(TensorModule):
         impulse: Tensor | None = None
         on_boundaries: list[Tensor] = []
         if boundaries := self.boundaries.entries:
-            asked = nodes[:, 0] if state.impulse is not None else None
-            velocity, on_boundaries = after_boundaries(blocks, velocity, boundaries, state, dt, asked)
+            velocity, on_boundaries = after_boundaries(
+                *(blocks, velocity, nodes[:, 0], boundaries, state, dt, self.walls), impulses=state.impulse is not None
+            )
         if state.impulse is not None:
             impulse = torch.cat([*on_boundaries, wall_impulses(blocks, nodes, gravity, dt, self.walls)], 1)
         return velocity, impulse
@@ -385,6 +387,27 @@ class Step(TensorModule):
             return torch.tensor(gravity, dtype=x.dtype, device=x.device).expand(self.grid.scenes, -1).contiguous()
 
         return self._kept_gravity.get((gravity, x.dtype, x.device), make, x)
+
+    def project(self, state: State) -> tuple[State, Tensor]:
+        """A state whose particles inside obstacles are moved to the nearest point of free space, and how many of each
+        scene were.
+
+        Particles may be found inside after seeding, or where an obstacle appears. They are pushed out slowly, with
+        stress, or not at all where they are deep; a particle that was moved keeps all else that it has. Obstacles are
+        where they are at `state.time`; those on which hooks or an `apply` of their own act are left alone. Without
+        gradient; nothing here synchronises with a GPU.
+
+        Returns:
+            The state, and the numbers of particles that were moved, int64 [B].
+        """
+        check_state(state)
+        x, moved = project(self.boundaries.entries, self.walls, self.grid, state)
+        scenes = self.grid.scenes
+        if state.scene is None:
+            return state.replace(x=x), moved.sum().expand(scenes).clone()
+        count = torch.zeros(scenes, dtype=torch.int64, device=x.device)
+        count.index_add_(0, state.scene.clamp(0, scenes - 1).long(), moved.long())
+        return state.replace(x=x), count
 
     def with_impulses(self, state: State) -> State:
         """A state that counts impulses: from here on steps accumulate those of the material on boundaries and walls.
@@ -518,6 +541,7 @@ class Step(TensorModule):
             PrecisionWarning: where the positions of the state do not resolve the cells, see `Grid`.
             FrontWarning: where steps were so long that fronts between phases lag behind, see `Heat`.
             LockingWarning: where an elastic law is nearly incompressible. A new step warns of values on the CPU.
+            ThinWallWarning: for boxes and revolved shapes that are thinner than 4 dx.
 
         Raises:
             SimulationError: that names each scene (up to a dozen of a kind), when and how many, and has `failures`: if
@@ -533,6 +557,7 @@ class Step(TensorModule):
         locking.warn(self.law, self.grid.kernel)
         if state is not None:
             resolution.check(self.grid, state.x.dtype)
+        warn_of_thin_walls(self.boundaries.entries, self.grid.dx)
 
     def explain(self, state: State, dt: float | Tensor = 1.0, speed: float | None = None, n: int = 1000) -> str:
         """The plan of `rollout` for n steps in words: executor and schedule, and a line with the reason against each of

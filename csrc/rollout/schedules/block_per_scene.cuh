@@ -1,5 +1,6 @@
 #pragma once
 
+#include "grid/contact.h"
 #include "rollout/schedules/block_per_scene.h"
 #include "transfer/advance_gather.cuh"
 #include "transfer/scatter.cuh"
@@ -462,13 +463,9 @@ class SceneStep {
         node = {T(0), zero_vector<T, D>()};
         continue;
       }
-      NodeRow<T, D> row = update_node(update, slot_update(update, slot), local, node);
-      if (a.obstacles) {
-        const ContactSlot<T, D> there = contact_slot(contact, slot);
-        if (there.active)
-          row.value = after_obstacles(contact, there, contact.obstacles, node_position(contact, there.corner, local),
-                                      row.value);
-      }
+      const SlotUpdate<T, D> there = slot_update(update, slot);
+      NodeRow<T, D> row = update_node(update, there, local, node);
+      if (a.obstacles) row.value = after_contact(contact, there.scene, there.corner, local, row.value);
       node = row;
     }
     __syncthreads();

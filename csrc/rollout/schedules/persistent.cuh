@@ -1,6 +1,7 @@
 #pragma once
 
 #include "cuda/barrier.cuh"
+#include "grid/contact.h"
 #include "grid/status.h"
 #include "rollout/plan.h"
 #include "rollout/schedules/persistent.h"
@@ -29,10 +30,8 @@ struct NodeVelocities {
   __device__ Vector<T, D> at(const SlotUpdate<T, D>& there, int slot, int local) const {
     const NodeRow<T, D> node = nodes.at(int64_t(slot) * kBlockNodes<D> + local);
     if (node.mass == T(0)) return zero_vector<T, D>();
-    Vector<T, D> v = update_node(update, there, local, node).value;
-    if (!obstacles) return v;
-    const ContactSlot<T, D> s = contact_slot(contact, there.scene, there.corner);
-    return s.active ? after_obstacles(contact, s, contact.obstacles, node_position(contact, s.corner, local), v) : v;
+    const Vector<T, D> v = update_node(update, there, local, node).value;
+    return obstacles ? after_contact(contact, there.scene, there.corner, local, v) : v;
   }
 };
 

@@ -1,0 +1,475 @@
+#pragma once
+
+#include "grid/solid.h"
+
+// Contact of nodes with the obstacles of their scene: velocities after it, impulses, and adjoints.
+namespace mpm {
+
+inline namespace TORCH_MPM_ISA {
+
+// The surfaces that a node meets: faces of obstacles, and walls of the domain.
+template <class T, int D>
+struct NodeContact {
+  int count = 0;  // of faces
+  int obstacle[D], face[D];
+  Vector<T, D> at[D];     // where normals are read
+  Vector<T, D> position;  // of the node, within the walls
+  Vector<T, D> sign;      // of velocities there
+  unsigned walls = 0;     // bits of those that the node is at or beyond
+
+  MPM_HD void add(int k, int f, const Vector<T, D>& point) {
+    obstacle[count] = k, face[count] = f, at[count] = point;
+    count++;
+  }
+  MPM_HD bool meets(int k) const {
+    bool found = false;
+    for (int i = 0; i < count; i++) found = found || obstacle[i] == k;
+    return found;
+  }
+};
+
+template <class T, int D>
+MPM_HD T distance_to(const ObstaclePose<T, D>& pose, const Vector<T, D>& x) {
+  Vector<T, D> normal;
+  return surface(pose, to_body(pose, x), normal);
+}
+
+// Of a box, that of the first axis among faces that are equally near, and of these the upper one; −1 of other shapes.
+template <class T, int D>
+MPM_HD int nearest_face(const ContactArguments<T, D>& a, const ObstaclePose<T, D>& pose, const Vector<T, D>& body) {
+  if (pose.shape != ObstacleShape::box) return -1;
+  T least = std::numeric_limits<T>::max();
+  int face = 0;
+  MPM_UNROLL for (int i = 0; i < D; i++) {
+    const T depth = rounded_depth(a, T(0.5) * pose.row->extent[i] - abs(body[i]));
+    if (!(depth < least)) continue;
+    least = depth;
+    face = 2 * i + (rounded_depth(a, body[i]) < T(0) ? 0 : 1);
+  }
+  return face;
+}
+
+// ---- nodes that one surface alone is near, as most have it
+
+template <class T, int D>
+struct NodeTouch {
+  static constexpr int none = -1, several = -2;
+  int obstacle = none;  // or `several`, where `find_surfaces` has to find what is near
+  Contact kind;
+  T friction;
+  Vector<T, D> normal, velocity;  // unit normal into the material, velocity of the surface
+
+  MPM_HD Vector<T, D> after(const Vector<T, D>& v) const {
+    const Vector<T, D> u = v + T(-1) * velocity;
+    return v + (contact_velocity(kind, u, normal, friction) + T(-1) * u);
+  }
+};
+
+// Finds the surface that a node meets, from the obstacles near its slot.
+template <class T, int D>
+class NearestSurface {
+ public:
+  MPM_HD NearestSurface(const ContactArguments<T, D>& a, const Vector<T, D>& position) : a_(a), position_(position) {}
+
+  MPM_HD void operator()(int k, const ObstaclePose<T, D>& pose) {
+    Vector<T, D> normal;
+    T other;
+    const Vector<T, D> body = to_body(pose, position_);
+    const T distance = surface(pose, body, normal, other);
+    if (!(distance < nearest_)) {
+      if (distance < second_) second_ = distance;
+      return;
+    }
+    second_ = nearest_ < other ? nearest_ : other;
+    nearest_ = distance;
+    if (!(distance <= a_.rounding)) return;
+    if (pose.shape == ObstacleShape::box) {
+      const int face = nearest_face(a_, pose, body);
+      MPM_UNROLL for (int i = 0; i < D; i++)
+        normal[i] = T(face == 2 * i + 1) - T(face == 2 * i);
+    }
+    touch_ = {k, pose.contact, pose.row->friction, pose.rotation * normal, velocity_at(pose, position_)};
+  }
+
+  MPM_HD bool is_inside() const { return nearest_ <= a_.rounding; }
+
+  // Of the obstacles that were given. `walled` is whether walls are near.
+  MPM_HD NodeTouch<T, D> found(bool walled) {
+    const T wall = walled ? nearest_wall(a_, position_) : std::numeric_limits<T>::max();
+    const T away = 2 * SolidAt<T, D>::seam_of(a_) - nearest_;
+    const bool joins = is_inside() && (second_ <= away || wall <= away);
+    if (joins || wall <= near_wall(a_)) touch_.obstacle = NodeTouch<T, D>::several;
+    return touch_;
+  }
+
+  // How near a node at a wall is to it.
+  MPM_HD static T near_wall(const ContactArguments<T, D>& a) { return a.rounding + T(1e-6 * a.dx); }
+
+ private:
+  const ContactArguments<T, D>& a_;
+  const Vector<T, D> position_;
+  T nearest_ = std::numeric_limits<T>::max(), second_ = std::numeric_limits<T>::max();
+  NodeTouch<T, D> touch_;
+};
+
+// ---- nodes near several surfaces
+
+// The least deep obstacle that a position is in, −1 for none. Of equally deep ones the stricter counts, and then that
+// of more friction, as `SolidAt` has it.
+template <class T, int D>
+MPM_HD_CALL int obstacle_around(const SlotPoses<T, D>& poses, const Vector<T, D>& x) {
+  const auto& a = poses.a;
+  int found = -1;
+  T least = T(0);
+  for (uint64_t left = poses.s.near; left; left &= left - 1) {
+    const int k = lowest_bit(left);
+    const T distance = distance_to(poses[k], x);
+    if (!(distance <= a.rounding)) continue;
+    const T depth = rounded_depth(a, T(0) - distance);
+    if (found >= 0 && depth > least) continue;
+    if (found >= 0 && depth == least) {
+      const int kind = int(a.kind[k].contact), known = int(a.kind[found].contact);
+      if (kind > known) continue;
+      if (kind == known && !(poses.s.row[k].friction > poses.s.row[found].friction)) continue;
+    }
+    found = k, least = depth;
+  }
+  return found;
+}
+
+template <class T, int D>
+MPM_HD_CALL void find_in_solid(const SlotPoses<T, D>& poses, int inside, NodeContact<T, D>& c) {
+  const auto& a = poses.a;
+  SolidAt<T, D> solid(poses, c.position);
+  solid.find();
+  const auto& foot = solid.foot();
+  for (int i = 0; i < foot.count; i++) {
+    const auto& face = solid.face(i);
+    const bool frozen = face.flat && a.kind[face.obstacle].shape == ObstacleShape::sampled;
+    c.add(face.obstacle, face.face, frozen ? face.at : c.position);
+  }
+  if (foot.count == 0) c.add(inside, -1, c.position);  // deep inside
+}
+
+template <class T, int D>
+MPM_HD_CALL NodeContact<T, D> find_surfaces(const SlotPoses<T, D>& poses, const Vector<T, D>& position) {
+  const auto& a = poses.a;
+  NodeContact<T, D> c;
+  c.position = within_walls(a, position, T(0), c.sign);
+  int around = obstacle_around(poses, c.position);
+  const T near = NearestSurface<T, D>::near_wall(a);
+  for (int face = 0; face < 2 * D; face++)
+    if (a.wall_kind[face] != Contact::open && wall_height(a, face, c.position) <= near) c.walls |= 1u << face;
+  if (around < 0 && c.walls) {  // a gap between an obstacle and a wall
+    Vector<T, D> sign;
+    const Vector<T, D> beside = within_walls(a, position, SolidAt<T, D>::seam_of(a), sign);
+    around = obstacle_around(poses, beside);
+    if (around >= 0) c.position = beside;
+  }
+  if (around >= 0) find_in_solid(poses, around, c);
+  return c;
+}
+
+// ---- any node
+
+template <class T, int D>
+MPM_HD NodeTouch<T, D> touch_of_node(const SlotPoses<T, D>& poses, const Vector<T, D>& position) {
+  if (poses.s.near == 0) return {};
+  NearestSurface<T, D> nearest(poses.a, position);
+  const auto visit = [&](uint64_t obstacles) {
+    for (uint64_t left = obstacles; left; left &= left - 1) nearest(lowest_bit(left), poses[lowest_bit(left)]);
+  };
+  visit(poses.s.touching);
+  if (nearest.is_inside()) visit(poses.s.near & ~poses.s.touching);
+  return nearest.found(poses.s.walled);
+}
+
+// The surfaces that a node at a position meets.
+template <class T, int D>
+MPM_HD NodeContact<T, D> contact_of_node(const SlotPoses<T, D>& poses, const Vector<T, D>& position) {
+  const int k = touch_of_node(poses, position).obstacle;
+  if (k == NodeTouch<T, D>::several) return find_surfaces(poses, position);
+  NodeContact<T, D> c;
+  c.position = position;
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    c.sign[i] = T(1);
+  if (k >= 0) c.add(k, nearest_face(poses.a, poses[k], to_body(poses[k], position)), position);
+  return c;
+}
+
+template <class S, class T, int D>
+MPM_HD_CALL Constraint<S, D> constraint_of(const ObstaclePose<S, D>& pose, int k, int face, const Vector<T, D>& at,
+                                           const Vector<T, D>& position) {
+  Constraint<S, D> c;
+  T beyond;
+  Vector<S, D> normal;
+  face_height(pose, face, to_body(pose, at), normal, beyond);
+  c.owner = k;
+  c.kind = pose.contact;
+  c.friction = pose.row->friction;
+  c.normal = pose.rotation * normal;
+  c.velocity = velocity_at(pose, position);
+  return c;
+}
+
+template <class S, class T, int D>
+MPM_HD Constraint<S, D> constant(const Constraint<T, D>& c) {
+  Constraint<S, D> r;
+  r.owner = c.owner, r.kind = c.kind, r.friction = lift<S>(c.friction);
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    r.normal[i] = lift<S>(c.normal[i]), r.velocity[i] = lift<S>(c.velocity[i]);
+  return r;
+}
+
+// The walls that a node meets beside obstacles keep the normal velocity that the grid update gave it. Sticky ones leave
+// the node to the obstacle.
+template <class S, class T, int D>
+MPM_HD_CALL void add_walls(const ContactArguments<T, D>& a, const NodeContact<T, D>& contact, Constraints<S, D>& c) {
+  for (int face = 0; face < 2 * D; face++) {
+    if (!(contact.walls >> face & 1) || a.wall_kind[face] == Contact::sticky) continue;
+    Constraint<S, D> wall;
+    wall.owner = -1;
+    wall.kind = a.wall_kind[face] == Contact::mirror ? Contact::slip : a.wall_kind[face];
+    wall.friction = S(T(0));
+    wall.velocity = zero_vector<S, D>();
+    bool known = false;
+    MPM_UNROLL for (int i = 0; i < D; i++)
+      wall.normal[i] = S(face == 2 * i ? 1 : face == 2 * i + 1 ? -1 : 0);
+    for (int i = 0; i < c.count; i++) known = known || abs(value_of(dot(c.e[i].normal, wall.normal))) > T(0.99);
+    if (!known) c.e[c.count++] = wall;
+  }
+}
+
+template <class T, int D>
+MPM_HD_CALL Constraints<T, D> constraints_of(const SlotPoses<T, D>& poses, const NodeContact<T, D>& contact) {
+  Constraints<T, D> c;
+  for (int i = 0; i < contact.count; i++)
+    c.e[c.count++] = constraint_of(poses[contact.obstacle[i]], contact.obstacle[i], contact.face[i], contact.at[i],
+                                   contact.position);
+  add_walls(poses.a, contact, c);
+  return c;
+}
+
+template <class T, int D>
+MPM_HD Vector<T, D> reflected(const Vector<T, D>& sign, Vector<T, D> v) {
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    v[i] = sign[i] * v[i];
+  return v;
+}
+
+// The velocity v of a node after contact with all surfaces that are near.
+template <class T, int D>
+MPM_HD_CALL Vector<T, D> after_surfaces(const SlotPoses<T, D>& poses, const Vector<T, D>& position,
+                                        const Vector<T, D>& v) {
+  const NodeContact<T, D> contact = find_surfaces(poses, position);
+  if (contact.count == 0) return v;
+  return reflected(contact.sign, after_constraints(constraints_of(poses, contact), reflected(contact.sign, v)));
+}
+
+// The same of any node.
+template <class T, int D>
+MPM_HD Vector<T, D> after_contact(const SlotPoses<T, D>& poses, const NodeTouch<T, D>& touch,
+                                  const Vector<T, D>& position, const Vector<T, D>& v) {
+  if (touch.obstacle == NodeTouch<T, D>::none) return v;
+  if (touch.obstacle == NodeTouch<T, D>::several) return after_surfaces(poses, position, v);
+  return touch.after(v);
+}
+
+// A node whose thread looks at it alone: the slot and its touch are found in one loop over the obstacles.
+template <class T, int D>
+struct LoneNode {
+  ContactSlot<T, D> slot;
+  NodeTouch<T, D> touch;
+
+  MPM_HD void find(const ContactArguments<T, D>& a, int scene, const int (&corner)[D], int local) {
+    NearestSurface<T, D> nearest(a, node_position(a, corner, local));
+    slot = contact_slot(a, scene, corner, nearest);
+    touch = slot.near ? nearest.found(slot.walled) : NodeTouch<T, D>();
+  }
+  MPM_HD Vector<T, D> after(const ContactArguments<T, D>& a, int local, const Vector<T, D>& v) const {
+    if (touch.obstacle == NodeTouch<T, D>::none) return v;
+    if (touch.obstacle != NodeTouch<T, D>::several) return touch.after(v);
+    return after_surfaces(SlotPoses<T, D>(a, slot), node_position(a, slot.corner, local), v);
+  }
+};
+
+template <class T, int D>
+MPM_HD Vector<T, D> after_contact(const ContactArguments<T, D>& a, int scene, const int (&corner)[D], int local,
+                                  const Vector<T, D>& v) {
+  LoneNode<T, D> node;
+  node.find(a, scene, corner, local);
+  return node.after(a, local, v);
+}
+
+// ---- passes over the nodes of a slot
+
+template <class T, int D>
+MPM_HD bool may_meet(const ContactArguments<T, D>& a, const ContactSlot<T, D>& s, int64_t node) {
+  return s.near && !(a.mass && a.mass[node * a.mass_stride] == T(0));
+}
+
+template <class T, int D>
+MPM_HD Vector<T, D> load_node(const T* values, int64_t stride, int64_t node) {
+  Vector<T, D> v;
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    v[i] = values[node * stride + i];
+  return v;
+}
+
+template <class T, int D>
+MPM_HD void store_node(T* values, int64_t node, const Vector<T, D>& v, const T& first = T(0)) {
+  T* const row = values + node * (1 + D);
+  row[0] = first;
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    row[1 + i] = v[i];
+}
+
+// The nodes lane, lane + Lanes, ... of a slot.
+template <int Lanes, class T, int D>
+MPM_HD void slot_contact(const ContactArguments<T, D>& a, int slot, int lane) {
+  const SlotPoses<T, D> poses(a, slot);
+  const ContactSlot<T, D>& s = poses.s;
+  const int64_t first = int64_t(slot) * kBlockNodes<D>;
+  if (s.near == 0) {
+    for (int local = lane; local < kBlockNodes<D>; local += Lanes)
+      store_node(a.result, first + local, load_node<T, D>(a.velocity, a.stride, first + local));
+    return;
+  }
+  for (int local = lane; local < kBlockNodes<D>; local += Lanes) {
+    Vector<T, D> v = load_node<T, D>(a.velocity, a.stride, first + local);
+    if (may_meet(a, s, first + local)) {
+      const Vector<T, D> position = node_position(a, s.corner, local);
+      v = after_contact(poses, touch_of_node(poses, position), position, v);
+    }
+    store_node(a.result, first + local, v);
+  }
+}
+
+// Calls put(k, taken) with the velocity that each obstacle takes from a node of velocity v. What walls give beside
+// obstacles counts as that of the first.
+template <class T, int D, class Put>
+MPM_HD void taken_by_obstacles(const SlotPoses<T, D>& poses, const NodeContact<T, D>& contact, const Vector<T, D>& v,
+                               Put&& put) {
+  const Constraints<T, D> c = constraints_of(poses, contact);
+  Vector<T, D> change[Constraints<T, D>::most];
+  changes_of_constraints<T, D>(c, reflected(contact.sign, v), change);
+  for (int i = 0; i < c.count; i++)
+    put(c.e[i].owner < 0 ? c.e[0].owner : c.e[i].owner, T(-1) * reflected(contact.sign, change[i]));
+}
+
+// ---- adjoints
+
+// The adjoint of the changes by obstacles at a node: grad of the velocity after contact, less that of the impulses.
+template <class T, int D>
+struct NodeAdjoint {
+  Vector<T, D> before, grad;  // velocity before contact, adjoint of that after it
+  Vector<T, D> weight[D];     // of the change by each face
+};
+
+// Derivative of the adjoint's scalar along a direction, from the constraints and the velocity as dual numbers.
+template <class T, int D>
+MPM_HD_CALL T directional_derivative(const Constraints<Dual<T>, D>& c, const NodeContact<T, D>& contact,
+                                     const Vector<Dual<T>, D>& v, const NodeAdjoint<T, D>& node) {
+  Vector<Dual<T>, D> change[Constraints<Dual<T>, D>::most];
+  changes_of_constraints<Dual<T>, D>(c, v, change);
+  T sum = T(0);
+  for (int i = 0; i < c.count; i++) {
+    const Vector<T, D>& weight = node.weight[c.e[i].owner < 0 ? 0 : i];
+    MPM_UNROLL for (int j = 0; j < D; j++)
+      sum += weight[j] * contact.sign[j] * change[i][j].derivative;
+  }
+  return sum;
+}
+
+// Adjoint of the velocity before contact.
+template <class T, int D>
+MPM_HD_CALL Vector<T, D> velocity_adjoint(const SlotPoses<T, D>& poses, const NodeContact<T, D>& contact,
+                                          const NodeAdjoint<T, D>& node) {
+  using S = Dual<T>;
+  const Constraints<T, D> values = constraints_of(poses, contact);
+  Constraints<S, D> c;
+  c.count = values.count;
+  for (int i = 0; i < c.count; i++) c.e[i] = constant<S>(values.e[i]);
+  Vector<T, D> result = node.grad;
+  for (int axis = 0; axis < D; axis++) {
+    Vector<S, D> v;
+    MPM_UNROLL for (int i = 0; i < D; i++)
+      v[i] = S(contact.sign[i] * node.before[i], i == axis ? contact.sign[i] : T(0));
+    result[axis] += directional_derivative(c, contact, v, node);
+  }
+  return result;
+}
+
+// Adjoint of a parameter of an obstacle by a node that meets it.
+template <class T, int D>
+MPM_HD_CALL T parameter_adjoint(const SlotPoses<T, D>& poses, const NodeContact<T, D>& contact, int k, int parameter,
+                                const NodeAdjoint<T, D>& node) {
+  using S = Dual<T>;
+  const auto& a = poses.a;
+  ObstacleRow<S, D> row;
+  const T* const values = reinterpret_cast<const T*>(poses.s.row + k);
+  S* const lifted = reinterpret_cast<S*>(&row);
+  for (int i = 0; i < ObstacleRow<T, D>::width; i++) lifted[i] = S(values[i], i == parameter ? T(1) : T(0));
+  const ObstaclePose<S, D> pose = obstacle_pose(a, a.kind[k], row, poses.s.scene);
+  Constraints<S, D> c;
+  for (int i = 0; i < contact.count; i++) {
+    const int owner = contact.obstacle[i];
+    c.e[c.count++] =
+        owner == k ? constraint_of(pose, k, contact.face[i], contact.at[i], contact.position)
+                   : constant<S>(constraint_of(poses[owner], owner, contact.face[i], contact.at[i], contact.position));
+  }
+  add_walls(a, contact, c);
+  Vector<S, D> v;
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    v[i] = lift<S>(contact.sign[i] * node.before[i]);
+  return directional_derivative(c, contact, v, node);
+}
+
+// `sum_lanes` adds a number over the lanes of a slot; the first lane gets the sum. `impulses(scene, node)` are
+// `NodeImpulses` of a node, or `NoImpulses`.
+template <int Lanes, class T, int D, class SumLanes, class ImpulsesOf>
+MPM_HD void slot_contact_backward(const ContactArguments<T, D>& a, int slot, int lane, SumLanes&& sum_lanes,
+                                  ImpulsesOf&& impulses) {
+  constexpr int count = kBlockNodes<D> / Lanes, width = ObstacleRow<T, D>::width;
+  constexpr bool with_impulses = decltype(impulses(0, 0))::wanted;
+  const SlotPoses<T, D> poses(a, slot);
+  const ContactSlot<T, D>& s = poses.s;
+  const int64_t first = int64_t(slot) * kBlockNodes<D> + lane;
+  NodeContact<T, D> contact[count];
+  NodeAdjoint<T, D> node[count];
+  for (int n = 0; n < count; n++) {
+    const Vector<T, D> grad = load_node<T, D>(a.grad, a.grad_stride, first + n * Lanes);
+    Vector<T, D> result = grad;
+    T mass_grad = T(0);
+    if (may_meet(a, s, first + n * Lanes))
+      contact[n] = contact_of_node(poses, node_position(a, s.corner, lane + n * Lanes));
+    if (contact[n].count > 0) {
+      node[n].before = load_node<T, D>(a.velocity, a.stride, first + n * Lanes);
+      node[n].grad = grad;
+      for (int i = 0; i < contact[n].count; i++) node[n].weight[i] = grad;
+      if constexpr (with_impulses) {
+        const auto own = impulses(s.scene, first + n * Lanes);
+        const Vector<int, D> at = lattice_node<D>(s.corner, lane + n * Lanes);
+        for (int i = 0; i < contact[n].count; i++)
+          node[n].weight[i] = grad + (T(0) - own.mass) * own.weight(contact[n].obstacle[i], at);
+        taken_by_obstacles(poses, contact[n], node[n].before,
+                           [&](int k, const Vector<T, D>& taken) { mass_grad += dot(own.weight(k, at), taken); });
+      }
+      result = velocity_adjoint(poses, contact[n], node[n]);
+    }
+    store_node(a.result, first + n * Lanes, result, mass_grad);
+  }
+  for (int k = 0; a.row_grad && k < a.obstacles; k++) {
+    const bool near = s.near >> k & 1;
+    for (int i = 0; i < width; i++) {
+      T sum = T(0);
+      for (int n = 0; near && n < count; n++)
+        if (contact[n].meets(k)) sum += parameter_adjoint(poses, contact[n], k, i, node[n]);
+      if (near) sum = sum_lanes(sum);
+      if (lane == 0) a.row_grad[(int64_t(slot) * a.obstacles + k) * width + i] = sum;
+    }
+  }
+}
+
+}  // namespace TORCH_MPM_ISA
+}  // namespace mpm

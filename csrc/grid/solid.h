@@ -1,0 +1,541 @@
+#pragma once
+
+#include "grid/constraints.h"
+#include "grid/obstacle.h"
+
+// All obstacles of a scene as one solid: the surfaces that a node inside it meets.
+//
+// Free space is what lies outside all obstacles. A node inside meets the surfaces of the point of free space that is
+// nearest to it, its foot: one face, or all that join at an inner edge or corner. Faces that lie inside another
+// obstacle, on one, or at a wall of the domain that they look at, are no surfaces of free space; so the seam of two
+// boxes does not act. Candidates for the foot are the feet on each face, and the points where two or three faces meet,
+// that are exposed: a step from there into free space leaves all obstacles. Of these that of the least depth counts,
+// where the depth below several faces is the largest of those below each; so walls of tanks may be as thin at a corner
+// as elsewhere.
+//
+// Nodes at a wall of the domain or beyond see the obstacles as the nearest point of the wall does, those behind a
+// mirror as their images do.
+namespace mpm {
+
+constexpr double kReach = 3;    // cells: how far from free space nodes meet its faces
+constexpr double kSeam = 0.1;   // cells: half of it is the width of gaps and the height of steps that count as closed
+constexpr double kSame = 0.94;  // cosine between normals that count as one, of shapes known by their distance alone
+constexpr int kMostFaces = 12;  // that a node looks at, the nearest ones
+
+inline namespace TORCH_MPM_ISA {
+
+// What the nodes of a slot share.
+template <class T, int D>
+struct ContactSlot {
+  bool active = false;
+  bool walled = false;  // whether a wall is near
+  int scene = 0;
+  int corner[D] = {};                      // lattice index of the first node
+  uint64_t near = 0;                       // bits of the obstacles that a node may meet, or have beside these
+  uint64_t touching = 0;                   // bits of those that a node may be in
+  const ObstacleRow<T, D>* row = nullptr;  // the obstacles of its scene
+};
+
+// ---- walls
+
+template <class T, int D>
+MPM_HD T wall_height(const ContactArguments<T, D>& a, int face, const Vector<T, D>& x) {
+  return face % 2 ? a.wall_plane[face] - x[face / 2] : x[face / 2] - a.wall_plane[face];
+}
+
+// A position within the walls, and the signs that reflect velocities there: −1 along the axes of mirrors that it is
+// behind. `inset` is how far from walls it stays [m].
+template <class T, int D>
+MPM_HD Vector<T, D> within_walls(const ContactArguments<T, D>& a, Vector<T, D> x, const T& inset, Vector<T, D>& sign) {
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    sign[i] = T(1);
+  MPM_UNROLL for (int face = 0; face < 2 * D; face++) {
+    const int axis = face / 2;
+    if (a.wall_kind[face] == Contact::open) continue;
+    const T height = wall_height(a, face, x);
+    if (a.wall_kind[face] == Contact::mirror && height < T(0)) {
+      x[axis] = 2 * a.wall_plane[face] - x[axis];
+      sign[axis] = T(-1);
+    }
+    if (wall_height(a, face, x) < inset) x[axis] = a.wall_plane[face] + (face % 2 ? T(0) - inset : inset);
+  }
+  return x;
+}
+
+template <class T, int D>
+MPM_HD T nearest_wall(const ContactArguments<T, D>& a, const Vector<T, D>& x) {
+  T nearest = std::numeric_limits<T>::max();
+  MPM_UNROLL for (int face = 0; face < 2 * D; face++) {
+    const T height = wall_height(a, face, x);
+    if (a.wall_kind[face] != Contact::open && height < nearest) nearest = height;
+  }
+  return nearest;
+}
+
+// ---- obstacles near a slot
+
+struct NoVisit {
+  template <class Pose>
+  MPM_HD void operator()(int, const Pose&) const {}
+};
+
+// Of an active block of a scene, with the lattice index of its first node. Calls visit(k, pose) for each obstacle that
+// is near: that may touch a node of the block or, beside others, have faces within reach of one. Distances change by no
+// more than the way from a point to another; samples of distances do so between the nodes of their lattice, so that the
+// slope of their multilinear interpolant is at most 1 along each axis.
+template <class T, int D, class Visit = NoVisit>
+MPM_HD ContactSlot<T, D> contact_slot(const ContactArguments<T, D>& a, int scene, const int (&corner)[D],
+                                      Visit&& visit = {}) {
+  ContactSlot<T, D> s;
+  s.scene = scene;
+  s.active = (a.rows == 1 || scene < a.rows) && (!a.scene_time || a.times == 1 || scene < a.times);
+  s.row = a.row + (a.rows == 1 ? 0 : int64_t(scene) * a.obstacles);
+  if (a.step_stride && a.activations) s.row += step_of_call(a) * a.step_stride;
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    s.corner[i] = corner[i];
+  if (!s.active) return s;
+  const T half = T(0.5 * (kBlockWidth - 1) * a.dx);
+  Vector<T, D> middle = node_position(a, s.corner, 0), sign;
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    middle[i] = middle[i] + half;
+  s.walled = nearest_wall(a, middle) <= half + T(kReach * a.dx);
+  if (s.walled) middle = within_walls(a, middle, T(0), sign);
+  const T radius = std::sqrt(T(D)) * half * T(1.001) + (s.walled ? T(kSeam * a.dx) : T(0));
+  const T margin = a.obstacles > 1 ? T((kReach + kSeam) * a.dx) : T(0);
+  for (int k = 0; k < a.obstacles; k++) {
+    const ObstaclePose<T, D> pose = obstacle_pose(a, a.kind[k], s.row[k], scene);
+    if (!pose.acts) continue;
+    Vector<T, D> normal;
+    const T slope = pose.shape == ObstacleShape::sampled ? std::sqrt(T(D)) : T(1);
+    const T way = surface(pose, to_body(pose, middle), normal) - a.rounding;
+    if (!(way <= slope * (radius + margin))) continue;
+    s.near |= uint64_t(1) << k;
+    if (way <= slope * radius) s.touching |= uint64_t(1) << k;
+    visit(k, pose);
+  }
+  if (!s.touching) s.near = 0;
+  return s;
+}
+
+template <class T, int D, class Visit = NoVisit>
+MPM_HD ContactSlot<T, D> contact_slot(const ContactArguments<T, D>& a, int slot, Visit&& visit = {}) {
+  const int index = a.block[slot];
+  if (index < 0) return {};
+  int corner[D];
+  const int scene = block_coordinates(a.geometry, index, corner);
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    corner[i] *= kBlockWidth;
+  return contact_slot(a, scene, corner, visit);
+}
+
+MPM_HD int lowest_bit(uint64_t bits) {
+#ifdef __CUDA_ARCH__
+  return __ffsll(static_cast<long long>(bits)) - 1;
+#else
+  return __builtin_ctzll(bits);
+#endif
+}
+
+// A slot and the obstacles near it. The CPU computes their poses once; a GPU, whose threads have little memory each,
+// whenever it looks at one.
+template <class T, int D>
+class SlotPoses {
+ public:
+  const ContactArguments<T, D>& a;
+
+#ifdef __CUDA_ARCH__
+  const ContactSlot<T, D> s;
+  MPM_HD SlotPoses(const ContactArguments<T, D>& arguments, const ContactSlot<T, D>& slot) : a(arguments), s(slot) {}
+  MPM_HD SlotPoses(const ContactArguments<T, D>& arguments, int slot) : a(arguments), s(contact_slot(a, slot)) {}
+  MPM_HD ObstaclePose<T, D> operator[](int k) const { return obstacle_pose(a, a.kind[k], s.row[k], s.scene); }
+#else
+ private:
+  ObstaclePose<T, D> pose_[kMaxObstacles];
+  auto store() {
+    return [this](int k, const ObstaclePose<T, D>& pose) { pose_[k] = pose; };
+  }
+
+ public:
+  const ContactSlot<T, D> s;
+  MPM_HD SlotPoses(const ContactArguments<T, D>& arguments, int slot)
+      : a(arguments), s(contact_slot(a, slot, store())) {}
+  MPM_HD SlotPoses(const ContactArguments<T, D>& arguments, const ContactSlot<T, D>& slot)
+      : a(arguments), s(contact_slot(a, slot.scene, slot.corner, store())) {}
+  MPM_HD const ObstaclePose<T, D>& operator[](int k) const { return pose_[k]; }
+#endif
+};
+
+// ---- faces near a node
+
+// A face and the point where its normal is read. The height of other points is read there too, or is that above the
+// plane through its surface at that point.
+template <class T, int D>
+struct Face {
+  int obstacle, face;
+  bool flat;
+  Vector<T, D> at, normal;
+  T height, depth;        // of `at`; of the node
+  bool is_plane = false;  // that a point beside a shape sees, see `add_plane`
+  T rounded = T(0);       // depth
+};
+
+template <class T, int D>
+struct Faces {
+  int count = 0;
+  Face<T, D> e[kMostFaces];
+};
+
+// A point between a node and free space, of whose faces the normals point there.
+template <class T, int D>
+struct Foot {
+  int count = 0;
+  int member[D] = {};
+  Vector<T, D> at, step;  // the step has the height 1 above all of them
+  T depth = T(0);         // rounded
+};
+
+// A depth in steps of 1e-4 cells, so that rounding does not tell apart what is equally deep.
+template <class T, int D>
+MPM_HD T rounded_depth(const ContactArguments<T, D>& a, const T& depth) {
+  return std::floor(depth * T(1e4 / a.dx) + T(0.5));
+}
+
+template <class T, int D>
+class SolidAt {
+ public:
+  using V = Vector<T, D>;
+
+  MPM_HD SolidAt(const SlotPoses<T, D>& poses, const V& node)
+      : poses_(poses), a_(poses.a), node_(node), seam_(seam_of(poses.a)), reach_(T(kReach * poses.a.dx)) {}
+
+  MPM_HD static T seam_of(const ContactArguments<T, D>& a) {
+    const T seam = T(kSeam * a.dx);
+    return seam > 4 * a.rounding ? seam : 4 * a.rounding;
+  }
+
+  // Finds the faces that the node meets; their number is zero where none is near enough.
+  MPM_HD_CALL void find() {
+    for (uint64_t left = poses_.s.near; left; left &= left - 1) add_faces(lowest_bit(left));
+    Foot<T, D> foot;
+    foot.count = 1;
+    for (int i = 0; i < faces_.count && !is_deeper(i); i++) {
+      foot.member[0] = i;
+      try_foot(foot);
+    }
+    foot.count = 2;
+    for (int i = 0; i < faces_.count && !is_deeper(i); i++)
+      for (int j = 0; j < i; j++) {
+        foot.member[0] = j, foot.member[1] = i;
+        try_foot(foot);
+      }
+    if constexpr (D == 3) {
+      foot.count = 3;
+      for (int i = 0; i < faces_.count && !is_deeper(i); i++)
+        for (int j = 0; j < i; j++)
+          for (int k = 0; k < j; k++) {
+            foot.member[0] = k, foot.member[1] = j, foot.member[2] = i;
+            try_foot(foot);
+          }
+    }
+  }
+
+  MPM_HD const Foot<T, D>& foot() const { return best_; }
+  MPM_HD const Face<T, D>& face(int i) const { return faces_.e[best_.member[i]]; }
+
+ private:
+  // In order, as `goes_before` has it; the last one makes room. Of several sticky ones the first gives the node its
+  // velocity.
+  MPM_HD_CALL void add(Face<T, D> face) {
+    face.rounded = rounded_depth(a_, face.depth);
+    int at = faces_.count < kMostFaces ? faces_.count++ : kMostFaces;
+    for (; at > 0 && goes_before(face, faces_.e[at - 1]); at--)
+      if (at < kMostFaces) faces_.e[at] = faces_.e[at - 1];
+    if (at < kMostFaces) faces_.e[at] = face;
+  }
+
+  // An order that does not depend on that of obstacles and outlines: the nearest face, the stricter one, that of more
+  // friction, and by the normal.
+  MPM_HD_CALL bool goes_before(const Face<T, D>& face, const Face<T, D>& other) const {
+    if (face.rounded != other.rounded) return face.rounded < other.rounded;
+    const int kind = int(a_.kind[face.obstacle].contact), known = int(a_.kind[other.obstacle].contact);
+    if (kind != known) return kind < known;
+    const T friction = poses_.s.row[face.obstacle].friction, before = poses_.s.row[other.obstacle].friction;
+    if (friction != before) return friction > before;
+    return is_greater(face.normal, other.normal);
+  }
+
+  // By the sizes of components, as a box alone has it, and then by their signs; equal where these are nearly so.
+  MPM_HD_CALL static bool is_greater(const V& x, const V& y) {
+    for (int i = 0; i < D; i++) {
+      const T size = rounded_component(abs(x[i])), other = rounded_component(abs(y[i]));
+      if (size != other) return size > other;
+    }
+    for (int i = 0; i < D; i++) {
+      const T own = rounded_component(x[i]), other = rounded_component(y[i]);
+      if (own != other) return own > other;
+    }
+    return false;
+  }
+  MPM_HD static T rounded_component(const T& x) { return std::floor(x * T(1000) + T(0.5)); }
+
+  // Whether a foot on a face is deeper than the best one.
+  MPM_HD bool is_deeper(int face) const { return best_.count > 0 && faces_.e[face].rounded > best_.depth; }
+
+  MPM_HD_CALL T height_of(const ObstaclePose<T, D>& pose, int face, const V& x, V& normal) const {
+    T beyond;
+    V own;
+    const T height = face_height(pose, face, to_body(pose, x), own, beyond);
+    normal = pose.rotation * own;
+    return height;
+  }
+
+  MPM_HD_CALL void add_faces(int k) {
+    const auto& pose = poses_[k];
+    if (pose.shape == ObstacleShape::sampled) return add_by_distance(k);
+    const int count = face_count(pose);
+    if (pose.shape == ObstacleShape::box) {  // whose faces are all far where it is
+      V normal;
+      if (!(height_of(pose, -1, node_, normal) <= reach_)) return;
+    }
+    for (int f = 0; f < count; f++) {
+      Face<T, D> face{k, count == 1 ? -1 : f, is_flat(pose), node_, {}, T(0), T(0)};
+      T beyond;
+      V own;
+      face.height = face_height(pose, face.face, to_body(pose, node_), own, beyond);
+      face.depth = T(0) - face.height;
+      if (!(face.height <= seam_ / 2) || !(face.depth <= reach_) || beyond > reach_) continue;
+      face.normal = pose.rotation * own;
+      if (dot(face.normal, face.normal) > T(0.5)) add(face);
+    }
+  }
+
+  // Of a shape that is known by its distance alone, its surface, and the planes that free space sees around the point
+  // nearest to the node: those of the faces that join there; and where that point is covered, or the node is beside the
+  // shape, those that neighbours of the node see.
+  MPM_HD_CALL void add_by_distance(int k) {
+    const auto& pose = poses_[k];
+    Face<T, D> nearest{k, -1, false, node_, {}, T(0), T(0)};
+    nearest.height = height_of(pose, -1, node_, nearest.normal);
+    nearest.depth = T(0) - nearest.height;
+    bool covered = nearest.height > a_.rounding && nearest.height <= reach_;
+    if (nearest.height <= seam_ / 2 && nearest.depth <= reach_ && dot(nearest.normal, nearest.normal) > T(0.5)) {
+      const T spacing = pose.data[D], small = T(2.5) * seam_,
+              away = T(1.5) * spacing > small ? T(1.5) * spacing : small;
+      const V first = node_ + nearest.depth * nearest.normal;
+      for (int i = 0; i < kLeaning; i++) {
+        V normal;
+        const V at = seen_from(pose, first, nearest.normal, away, i);
+        const T height = height_of(pose, -1, at, normal);
+        // The plane that it sees goes through that point or behind it where faces join; it is before a rounded body.
+        const bool joins = height + dot(normal, first + T(-1) * at) >= T(-0.5) * seam_;
+        nearest.flat = nearest.flat || (height >= T(0) && joins && dot(normal, nearest.normal) < T(kSame));
+      }
+      if (!nearest.flat || is_a_face(pose, first, nearest.normal)) add(nearest);
+      for (int i = 0; nearest.flat && i < kLeaning; i++)
+        add_plane(k, pose, seen_from(pose, first, nearest.normal, away, i));
+      covered = covered || is_covered(k, pose, first, nearest.normal);
+    }
+    if (covered) add_seen_by_neighbours(k, pose);
+  }
+
+  // Whether a normal at a point of the surface is that of a face: at edges distances rise more slowly along it.
+  MPM_HD_CALL bool is_a_face(const ObstaclePose<T, D>& pose, const V& first, const V& normal) const {
+    V there;
+    return height_of(pose, -1, first + seam_ * normal, there) > T(0.8) * seam_;
+  }
+
+  // A point around a point of the surface; one behind a face is moved before it.
+  MPM_HD_CALL V seen_from(const ObstaclePose<T, D>& pose, const V& first, const V& axis, const T& away, int i) const {
+    const V at = first + away * leaning(axis, i);
+    V normal;
+    const T height = height_of(pose, -1, at, normal);
+    return height < T(0) ? at + (T(0.3) * away - height) * normal : at;
+  }
+
+  MPM_HD_CALL void add_seen_by_neighbours(int k, const ObstaclePose<T, D>& pose) {
+    constexpr int count = D == 2 ? 9 : 27;
+    for (int i = 1; i < count; i++) {
+      V way;
+      for (int j = 0, rest = i; j < D; j++, rest /= 3) way[j] = T(rest % 3 == 2 ? -1 : rest % 3);
+      add_plane(k, pose, node_ + reach_ * (pose.rotation * way));
+    }
+  }
+
+  // The plane that a point outside the shape sees, unless one with that normal is known.
+  MPM_HD_CALL void add_plane(int k, const ObstaclePose<T, D>& pose, const V& at) {
+    Face<T, D> face{k, -1, true, at, {}, T(0), T(0), true};
+    face.height = height_of(pose, -1, face.at, face.normal);
+    face.depth = T(0) - (face.height + dot(face.normal, node_ + T(-1) * face.at));
+    if (!(face.height >= T(0)) || !(dot(face.normal, face.normal) > T(0.5))) return;
+    if (!(face.depth >= T(0) - seam_) || face.depth > reach_) return;
+    for (int j = 0; j < faces_.count; j++) {
+      const Face<T, D>& known = faces_.e[j];
+      if (known.is_plane && known.obstacle == k && dot(known.normal, face.normal) > T(kSame)) return;
+    }
+    add(face);
+  }
+
+  // A unit vector, and directions at 55° to it, evenly around.
+  static constexpr int kLeaning = D == 2 ? 3 : 7;
+  MPM_HD_CALL static V leaning(const V& axis, int i) {
+    if (i == 0) return axis;
+    const T c = T(0.57357643635104616), s = T(0.81915204428899180);
+    const int k = i - 1;
+    if constexpr (D == 2) {
+      const T side = k ? s : T(0) - s;
+      return {{c * axis[0] - side * axis[1], c * axis[1] + side * axis[0]}};
+    } else {
+      // An orthonormal basis (Duff et al. 2017).
+      const T sign = axis[2] < T(0) ? T(-1) : T(1), f = T(-1) / (sign + axis[2]), g = axis[0] * axis[1] * f;
+      const V u = {{T(1) + sign * axis[0] * axis[0] * f, sign * g, T(0) - sign * axis[0]}};
+      const V w = {{g, sign + axis[1] * axis[1] * f, T(0) - axis[1]}};
+      const T cosine[3] = {T(1), T(0.5), T(-0.5)}, sine = k % 3 ? T(0.86602540378443865) : T(0);
+      const T turn = k < 3 ? s : T(0) - s;
+      return c * axis + turn * cosine[k % 3] * u + turn * sine * w;
+    }
+  }
+
+  MPM_HD_CALL T height_at(const Face<T, D>& face, const V& x, V& normal) const {
+    normal = face.normal;
+    if (face.flat) return face.height + dot(face.normal, x + T(-1) * face.at);
+    return height_of(poses_[face.obstacle], face.face, x, normal);
+  }
+
+  // The nearest point on all faces of a foot; false where there is none whose faces all stop the node.
+  MPM_HD_CALL bool solve(Foot<T, D>& foot) const {
+    bool curved = false;
+    for (int i = 0; i < foot.count; i++) curved = curved || !faces_.e[foot.member[i]].flat;
+    foot.at = node_;
+    for (int round = 0; round < (curved && foot.count > 1 ? 3 : 1); round++) {
+      V normal[D];
+      T gram[D][D], again[D][D], share[D], ones[D];
+      for (int i = 0; i < foot.count; i++) {
+        const T height = height_at(faces_.e[foot.member[i]], foot.at, normal[i]);
+        share[i] = dot(normal[i], foot.at + T(-1) * node_) - height;
+        ones[i] = T(1);
+      }
+      for (int i = 0; i < foot.count; i++)
+        for (int j = 0; j < foot.count; j++) gram[i][j] = again[i][j] = dot(normal[i], normal[j]);
+      if (!solve_definite<T, D>(gram, share, foot.count) || !solve_definite<T, D>(again, ones, foot.count))
+        return false;
+      foot.at = node_, foot.step = zero_vector<T, D>();
+      for (int i = 0; i < foot.count; i++) {
+        if (share[i] < T(0) - (foot.count > 1 ? seam_ / 2 : a_.rounding)) return false;
+        foot.at = foot.at + share[i] * normal[i];
+        foot.step = foot.step + ones[i] * normal[i];
+      }
+    }
+    return length(foot.at + T(-1) * node_) <= reach_;
+  }
+
+  // Whether the faces are there on the side of the foot where they bound free space, and that is free.
+  MPM_HD_CALL bool is_exposed(const Foot<T, D>& foot) const {
+    V normal;
+    for (int i = 0; i < foot.count; i++) {
+      const Face<T, D>& face = faces_.e[foot.member[i]];
+      const auto& pose = poses_[face.obstacle];
+      T near = seam_ / 2;
+      if (pose.shape == ObstacleShape::sampled) {  // whose normal is not defined at an edge
+        normal = face.normal;
+        near = near + T(0.5) * pose.data[D];
+      } else {
+        height_at(face, foot.at, normal);
+      }
+      const V beside = foot.at + seam_ * (foot.step + T(-1) * normal);
+      if (!(height_of(pose, -1, beside, normal) <= near)) return false;
+    }
+    return (foot.count == 1 || is_inner(foot)) && is_free(foot.at, foot.step);
+  }
+
+  // Whether the edge of a foot looks inwards, so that a point before all of its faces but one is in the body of that:
+  // tangents of a rounded body meet outside. Of samples, which round edges; others do not get here.
+  MPM_HD_CALL bool is_inner(const Foot<T, D>& foot) const {
+    V normal[D], unused;
+    for (int i = 0; i < foot.count; i++) height_at(faces_.e[foot.member[i]], foot.at, normal[i]);
+    for (int i = 0; i < foot.count; i++) {
+      const auto& pose = poses_[faces_.e[foot.member[i]].obstacle];
+      if (pose.shape != ObstacleShape::sampled) continue;
+      T gram[D][D], share[D];
+      for (int j = 0; j < foot.count; j++) {
+        share[j] = T(i == j);
+        for (int k = 0; k < foot.count; k++) gram[j][k] = dot(normal[j], normal[k]);
+      }
+      if (!solve_definite<T, D>(gram, share, foot.count)) return false;
+      V way = foot.step;  // of height −1 above face i and 1 above the others
+      for (int j = 0; j < foot.count; j++) way = way + T(-2) * share[j] * normal[j];
+      if (height_of(pose, -1, foot.at + pose.data[D] * way, unused) > T(0)) return false;
+    }
+    return true;
+  }
+
+  // Whether a step of the height of a seam from a point that is nearest to the node leads into another obstacle, a
+  // wall, or deeper into its own obstacle. Values of an inexact distance rise there, even if that point is not on the
+  // surface.
+  MPM_HD_CALL bool is_covered(int k, const ObstaclePose<T, D>& pose, const V& first, const V& normal) const {
+    V unused;
+    const T rise = height_of(pose, -1, first + seam_ * normal, unused) - height_of(pose, -1, first, unused);
+    return !(rise > T(0.25) * seam_) || !is_free(first, normal, uint64_t(1) << k);
+  }
+
+  // Whether a step of the height of a seam from a point of surfaces leads into free space, but for some obstacles.
+  MPM_HD_CALL bool is_free(const V& at, const V& step, uint64_t but = 0) const {
+    V normal;
+    const V free = at + seam_ * step;
+    for (uint64_t left = poses_.s.near & ~but; left; left &= left - 1)
+      if (!(height_of(poses_[lowest_bit(left)], -1, free, normal) > seam_ / 2)) return false;
+    constexpr double facing = 0.7;  // cosine above which a face looks at a wall
+    for (int face = 0; face < 2 * D; face++) {
+      if (a_.wall_kind[face] == Contact::open) continue;
+      const T towards = face % 2 ? step[face / 2] : T(0) - step[face / 2];
+      if (wall_height(a_, face, at) <= seam_ && towards > T(facing)) return false;
+    }
+    return true;
+  }
+
+  // Keeps a foot where it is exposed and less deep than the best one; of equals, by `comes_first`.
+  MPM_HD_CALL bool try_foot(Foot<T, D>& foot) {
+    foot.depth = faces_.e[foot.member[foot.count - 1]].rounded;
+    if (best_.count > 0 && foot.depth > best_.depth) return false;
+    if (!solve(foot) || !is_exposed(foot)) return false;
+    if (best_.count > 0 && !(foot.depth < best_.depth) && !comes_first(foot)) return false;
+    best_ = foot;
+    return true;
+  }
+
+  // Whether a foot as deep as the best one comes first, whatever the order of obstacles and outlines: by the number of
+  // its faces, by the strictest of their kinds, by their largest friction, and by where it leads.
+  MPM_HD_CALL bool comes_first(const Foot<T, D>& foot) const {
+    if (foot.count != best_.count) return foot.count > best_.count;
+    const int kind = strictest(foot), known = strictest(best_);
+    if (kind != known) return kind < known;
+    const T friction = largest_friction(foot), before = largest_friction(best_);
+    if (friction != before) return friction > before;
+    return is_greater(foot.step, best_.step);
+  }
+
+  MPM_HD int strictest(const Foot<T, D>& foot) const {
+    int kind = int(Contact::separate);
+    for (int i = 0; i < foot.count; i++) {
+      const int own = int(a_.kind[faces_.e[foot.member[i]].obstacle].contact);
+      if (own < kind) kind = own;
+    }
+    return kind;
+  }
+
+  MPM_HD T largest_friction(const Foot<T, D>& foot) const {
+    T friction = T(0);
+    for (int i = 0; i < foot.count; i++)
+      friction = max(friction, poses_.s.row[faces_.e[foot.member[i]].obstacle].friction);
+    return friction;
+  }
+
+  const SlotPoses<T, D>& poses_;
+  const ContactArguments<T, D>& a_;
+  const V node_;
+  const T seam_, reach_;
+  Faces<T, D> faces_;
+  Foot<T, D> best_;
+};
+
+}  // namespace TORCH_MPM_ISA
+}  // namespace mpm
