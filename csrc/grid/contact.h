@@ -152,9 +152,8 @@ MPM_HD_CALL void find_in_solid(const SlotPoses<T, D>& poses, int inside, NodeCon
 }
 
 template <class T, int D>
-MPM_HD_CALL NodeContact<T, D> find_surfaces(const SlotPoses<T, D>& poses, const Vector<T, D>& position) {
+MPM_HD_CALL void find_surfaces(const SlotPoses<T, D>& poses, const Vector<T, D>& position, NodeContact<T, D>& c) {
   const auto& a = poses.a;
-  NodeContact<T, D> c;
   c.position = within_walls(a, position, T(0), c.sign);
   int around = obstacle_around(poses, c.position);
   const T near = NearestSurface<T, D>::near_wall(a);
@@ -167,7 +166,6 @@ MPM_HD_CALL NodeContact<T, D> find_surfaces(const SlotPoses<T, D>& poses, const 
     if (around >= 0) c.position = beside;
   }
   if (around >= 0) find_in_solid(poses, around, c);
-  return c;
 }
 
 // ---- any node
@@ -184,41 +182,38 @@ MPM_HD NodeTouch<T, D> touch_of_node(const SlotPoses<T, D>& poses, const Vector<
   return nearest.found(poses.s.walled);
 }
 
-// The surfaces that a node at a position meets.
+// Finds the surfaces that a node at a position meets; `c` has none yet.
 template <class T, int D>
-MPM_HD NodeContact<T, D> contact_of_node(const SlotPoses<T, D>& poses, const Vector<T, D>& position) {
+MPM_HD void find_contact(const SlotPoses<T, D>& poses, const Vector<T, D>& position, NodeContact<T, D>& c) {
   const int k = touch_of_node(poses, position).obstacle;
-  if (k == NodeTouch<T, D>::several) return find_surfaces(poses, position);
-  NodeContact<T, D> c;
+  if (k == NodeTouch<T, D>::several) return find_surfaces(poses, position, c);
   c.position = position;
   MPM_UNROLL for (int i = 0; i < D; i++)
     c.sign[i] = T(1);
   if (k >= 0) c.add(k, nearest_face(poses.a, poses[k], to_body(poses[k], position)), position);
-  return c;
 }
 
+// Adds that of face i of a contact, whose obstacle has the given pose.
 template <class S, class T, int D>
-MPM_HD_CALL Constraint<S, D> constraint_of(const ObstaclePose<S, D>& pose, int k, int face, const Vector<T, D>& at,
-                                           const Vector<T, D>& position) {
-  Constraint<S, D> c;
+MPM_HD_CALL void add_face(const ObstaclePose<S, D>& pose, const NodeContact<T, D>& contact, int i,
+                          Constraints<S, D>& added) {
+  Constraint<S, D>& c = added.e[added.count++];
   T beyond;
   Vector<S, D> normal;
-  face_height(pose, face, to_body(pose, at), normal, beyond);
-  c.owner = k;
+  face_height(pose, contact.face[i], to_body(pose, contact.at[i]), normal, beyond);
+  c.owner = contact.obstacle[i];
   c.kind = pose.contact;
   c.friction = pose.row->friction;
   c.normal = pose.rotation * normal;
-  c.velocity = velocity_at(pose, position);
-  return c;
+  c.velocity = velocity_at(pose, contact.position);
 }
 
 template <class S, class T, int D>
-MPM_HD Constraint<S, D> constant(const Constraint<T, D>& c) {
-  Constraint<S, D> r;
+MPM_HD void add_constant(const Constraint<T, D>& c, Constraints<S, D>& added) {
+  Constraint<S, D>& r = added.e[added.count++];
   r.owner = c.owner, r.kind = c.kind, r.friction = lift<S>(c.friction);
   MPM_UNROLL for (int i = 0; i < D; i++)
     r.normal[i] = lift<S>(c.normal[i]), r.velocity[i] = lift<S>(c.velocity[i]);
-  return r;
 }
 
 // The walls that a node meets beside obstacles keep the normal velocity that the grid update gave it. Sticky ones leave
@@ -241,13 +236,11 @@ MPM_HD_CALL void add_walls(const ContactArguments<T, D>& a, const NodeContact<T,
 }
 
 template <class T, int D>
-MPM_HD_CALL Constraints<T, D> constraints_of(const SlotPoses<T, D>& poses, const NodeContact<T, D>& contact) {
-  Constraints<T, D> c;
-  for (int i = 0; i < contact.count; i++)
-    c.e[c.count++] = constraint_of(poses[contact.obstacle[i]], contact.obstacle[i], contact.face[i], contact.at[i],
-                                   contact.position);
+MPM_HD_CALL void find_constraints(const SlotPoses<T, D>& poses, const NodeContact<T, D>& contact,
+                                  Constraints<T, D>& c) {
+  c.count = 0;
+  for (int i = 0; i < contact.count; i++) add_face(poses[contact.obstacle[i]], contact, i, c);
   add_walls(poses.a, contact, c);
-  return c;
 }
 
 template <class T, int D>
@@ -261,9 +254,12 @@ MPM_HD Vector<T, D> reflected(const Vector<T, D>& sign, Vector<T, D> v) {
 template <class T, int D>
 MPM_HD_CALL Vector<T, D> after_surfaces(const SlotPoses<T, D>& poses, const Vector<T, D>& position,
                                         const Vector<T, D>& v) {
-  const NodeContact<T, D> contact = find_surfaces(poses, position);
+  NodeContact<T, D> contact;
+  find_surfaces(poses, position, contact);
   if (contact.count == 0) return v;
-  return reflected(contact.sign, after_constraints(constraints_of(poses, contact), reflected(contact.sign, v)));
+  Constraints<T, D> constraints;
+  find_constraints(poses, contact, constraints);
+  return reflected(contact.sign, after_constraints(constraints, reflected(contact.sign, v)));
 }
 
 // The same of any node.
@@ -350,7 +346,8 @@ MPM_HD void slot_contact(const ContactArguments<T, D>& a, int slot, int lane) {
 template <class T, int D, class Put>
 MPM_HD void taken_by_obstacles(const SlotPoses<T, D>& poses, const NodeContact<T, D>& contact, const Vector<T, D>& v,
                                Put&& put) {
-  const Constraints<T, D> c = constraints_of(poses, contact);
+  Constraints<T, D> c;
+  find_constraints(poses, contact, c);
   Vector<T, D> change[Constraints<T, D>::most];
   changes_of_constraints<T, D>(c, reflected(contact.sign, v), change);
   for (int i = 0; i < c.count; i++)
@@ -386,10 +383,10 @@ template <class T, int D>
 MPM_HD_CALL Vector<T, D> velocity_adjoint(const SlotPoses<T, D>& poses, const NodeContact<T, D>& contact,
                                           const NodeAdjoint<T, D>& node) {
   using S = Dual<T>;
-  const Constraints<T, D> values = constraints_of(poses, contact);
+  Constraints<T, D> values;
+  find_constraints(poses, contact, values);
   Constraints<S, D> c;
-  c.count = values.count;
-  for (int i = 0; i < c.count; i++) c.e[i] = constant<S>(values.e[i]);
+  for (int i = 0; i < values.count; i++) add_constant(values.e[i], c);
   Vector<T, D> result = node.grad;
   for (int axis = 0; axis < D; axis++) {
     Vector<S, D> v;
@@ -413,10 +410,13 @@ MPM_HD_CALL T parameter_adjoint(const SlotPoses<T, D>& poses, const NodeContact<
   const ObstaclePose<S, D> pose = obstacle_pose(a, a.kind[k], row, poses.s.scene);
   Constraints<S, D> c;
   for (int i = 0; i < contact.count; i++) {
-    const int owner = contact.obstacle[i];
-    c.e[c.count++] =
-        owner == k ? constraint_of(pose, k, contact.face[i], contact.at[i], contact.position)
-                   : constant<S>(constraint_of(poses[owner], owner, contact.face[i], contact.at[i], contact.position));
+    if (contact.obstacle[i] == k) {
+      add_face(pose, contact, i, c);
+    } else {
+      Constraints<T, D> other;
+      add_face(poses[contact.obstacle[i]], contact, i, other);
+      add_constant(other.e[0], c);
+    }
   }
   add_walls(a, contact, c);
   Vector<S, D> v;
@@ -442,7 +442,7 @@ MPM_HD void slot_contact_backward(const ContactArguments<T, D>& a, int slot, int
     Vector<T, D> result = grad;
     T mass_grad = T(0);
     if (may_meet(a, s, first + n * Lanes))
-      contact[n] = contact_of_node(poses, node_position(a, s.corner, lane + n * Lanes));
+      find_contact(poses, node_position(a, s.corner, lane + n * Lanes), contact[n]);
     if (contact[n].count > 0) {
       node[n].before = load_node<T, D>(a.velocity, a.stride, first + n * Lanes);
       node[n].grad = grad;

@@ -60,7 +60,7 @@ MPM_HD void slot_contact_impulses(const ContactImpulsesArguments<T, D>& a, int s
   NodeContact<T, D> contact[count];
   for (int n = 0; n < count; n++)
     if (s.near && a.mass[(first + n * Lanes) * a.mass_stride] != T(0))
-      contact[n] = contact_of_node(poses, node_position(c, s.corner, lane + n * Lanes));
+      find_contact(poses, node_position(c, s.corner, lane + n * Lanes), contact[n]);
   for (uint64_t left = s.near; left; left &= left - 1) {
     const int k = lowest_bit(left);
     ImpulseSum<D> sum;

@@ -245,7 +245,7 @@ class SolidAt {
  private:
   // In order, as `goes_before` has it; the last one makes room. Of several sticky ones the first gives the node its
   // velocity.
-  MPM_HD_CALL void add(Face<T, D> face) {
+  MPM_HD_CALL void add(Face<T, D>& face) {
     face.rounded = rounded_depth(a_, face.depth);
     int at = faces_.count < kMostFaces ? faces_.count++ : kMostFaces;
     for (; at > 0 && goes_before(face, faces_.e[at - 1]); at--)
