@@ -2,6 +2,7 @@
 
 #include <limits>
 
+#include "common/warp.h"
 #include "grid/friction.h"
 
 // The velocity of a node that meets several surfaces at once, as in the inner corner of a tank.
@@ -11,13 +12,6 @@
 // found exactly among the sets of surfaces that press. A sticky surface gives the node its own velocity. Coulomb
 // friction lowers the velocity along all pressing surfaces, relative to them, by at most Σ μ_i λ_i, where λ_i is the
 // normal velocity that surface i stops.
-
-// A call keeps the registers and instructions of what few nodes need out of the loops over all others.
-#if defined(__CUDACC__)
-#define MPM_HD_CALL __host__ __device__ __noinline__
-#else
-#define MPM_HD_CALL inline __attribute__((noinline))
-#endif
 
 namespace mpm {
 inline namespace TORCH_MPM_ISA {
@@ -59,7 +53,7 @@ MPM_HD_CALL bool solve_definite(S (&g)[D][D], S (&x)[D], int n) {
 
 // x with N_A x = b for the Gram matrix N of the normals of a set A; the entries of others are zero.
 template <class S, int D>
-MPM_HD_CALL bool solve_normals(const Constraints<S, D>& c, unsigned set, S (&b)[Constraints<S, D>::most]) {
+MPM_HD bool solve_normals(const Constraints<S, D>& c, unsigned set, S (&b)[Constraints<S, D>::most]) {
   int member[D], n = 0;
   for (int i = 0; i < c.count; i++) {
     if (!(set >> i & 1)) {
@@ -82,8 +76,8 @@ MPM_HD_CALL bool solve_normals(const Constraints<S, D>& c, unsigned set, S (&b)[
 // What each surface stops of a velocity v, λ, and the set of those that are met exactly. Of all sets that with the
 // least violation counts: zero, but for rounding or where normals are nearly dependent.
 template <class S, int D>
-MPM_HD_CALL unsigned stopped_velocities(const Constraints<S, D>& c, const Vector<S, D>& v,
-                                        S (&lambda)[Constraints<S, D>::most]) {
+MPM_HD unsigned stopped_velocities(const Constraints<S, D>& c, const Vector<S, D>& v,
+                                   S (&lambda)[Constraints<S, D>::most]) {
   using T = ValueOf<S>;
   constexpr T unmet = std::numeric_limits<T>::min();  // an equality counts as unmet where it is not in the set
   T least = std::numeric_limits<T>::max();
@@ -112,8 +106,8 @@ MPM_HD_CALL unsigned stopped_velocities(const Constraints<S, D>& c, const Vector
 
 // Friction along the surfaces of a set that stop λ: what it takes from a velocity v, in parts by surface.
 template <class S, int D>
-MPM_HD_CALL void add_friction(const Constraints<S, D>& c, unsigned set, const S (&lambda)[Constraints<S, D>::most],
-                              const Vector<S, D>& v, Vector<S, D> (&change)[Constraints<S, D>::most]) {
+MPM_HD void add_friction(const Constraints<S, D>& c, unsigned set, const S (&lambda)[Constraints<S, D>::most],
+                         const Vector<S, D>& v, Vector<S, D> (&change)[Constraints<S, D>::most]) {
   S limit[Constraints<S, D>::most], sum = S(0);
   Vector<S, D> surface = zero_vector<S, D>();
   bool rubs = false;
@@ -151,8 +145,8 @@ MPM_HD_CALL void add_friction(const Constraints<S, D>& c, unsigned set, const S 
 
 // Changes of a velocity v by each surface.
 template <class S, int D>
-MPM_HD_CALL void changes_of_constraints(const Constraints<S, D>& c, const Vector<S, D>& v,
-                                        Vector<S, D> (&change)[Constraints<S, D>::most]) {
+MPM_HD void changes_of_constraints(const Constraints<S, D>& c, const Vector<S, D>& v,
+                                   Vector<S, D> (&change)[Constraints<S, D>::most]) {
   for (int i = 0; i < c.count; i++) change[i] = zero_vector<S, D>();
   for (int i = 0; i < c.count; i++) {
     if (c.e[i].kind != Contact::sticky) continue;

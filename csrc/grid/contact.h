@@ -28,12 +28,6 @@ struct NodeContact {
   }
 };
 
-template <class T, int D>
-MPM_HD T distance_to(const ObstaclePose<T, D>& pose, const Vector<T, D>& x) {
-  Vector<T, D> normal;
-  return surface(pose, to_body(pose, x), normal);
-}
-
 // Of a box, that of the first axis among faces that are equally near, and of these the upper one; −1 of other shapes.
 template <class T, int D>
 MPM_HD int nearest_face(const ContactArguments<T, D>& a, const ObstaclePose<T, D>& pose, const Vector<T, D>& body) {
@@ -117,13 +111,15 @@ class NearestSurface {
 // The least deep obstacle that a position is in, −1 for none. Of equally deep ones the stricter counts, and then that
 // of more friction, as `SolidAt` has it.
 template <class T, int D>
-MPM_HD_CALL int obstacle_around(const SlotPoses<T, D>& poses, const Vector<T, D>& x) {
+MPM_HD int obstacle_around(const SlotPoses<T, D>& poses, const Vector<T, D>& x) {
   const auto& a = poses.a;
   int found = -1;
   T least = T(0);
   for (uint64_t left = poses.s.near; left; left &= left - 1) {
     const int k = lowest_bit(left);
-    const T distance = distance_to(poses[k], x);
+    Vector<T, D> normal;
+    T beyond;
+    const T distance = height_above(poses, k, -1, x, normal, beyond);
     if (!(distance <= a.rounding)) continue;
     const T depth = rounded_depth(a, T(0) - distance);
     if (found >= 0 && depth > least) continue;
@@ -138,7 +134,7 @@ MPM_HD_CALL int obstacle_around(const SlotPoses<T, D>& poses, const Vector<T, D>
 }
 
 template <class T, int D>
-MPM_HD_CALL void find_in_solid(const SlotPoses<T, D>& poses, int inside, NodeContact<T, D>& c) {
+MPM_HD void find_in_solid(const SlotPoses<T, D>& poses, int inside, NodeContact<T, D>& c) {
   const auto& a = poses.a;
   SolidAt<T, D> solid(poses, c.position);
   solid.find();
@@ -152,7 +148,9 @@ MPM_HD_CALL void find_in_solid(const SlotPoses<T, D>& poses, int inside, NodeCon
 }
 
 template <class T, int D>
-MPM_HD_CALL void find_surfaces(const SlotPoses<T, D>& poses, const Vector<T, D>& position, NodeContact<T, D>& c) {
+MPM_HD_CALL void find_surfaces(bool wanted, const SlotPoses<T, D>& poses, const Vector<T, D>& position,
+                               NodeContact<T, D>& c) {
+  if (!wanted) return;
   const auto& a = poses.a;
   c.position = within_walls(a, position, T(0), c.sign);
   int around = obstacle_around(poses, c.position);
@@ -182,11 +180,18 @@ MPM_HD NodeTouch<T, D> touch_of_node(const SlotPoses<T, D>& poses, const Vector<
   return nearest.found(poses.s.walled);
 }
 
-// Finds the surfaces that a node at a position meets; `c` has none yet.
+// Finds the surfaces that a node at a position meets; `c` has none yet. By all threads of a warp, as `any_of_warp`.
 template <class T, int D>
-MPM_HD void find_contact(const SlotPoses<T, D>& poses, const Vector<T, D>& position, NodeContact<T, D>& c) {
-  const int k = touch_of_node(poses, position).obstacle;
-  if (k == NodeTouch<T, D>::several) return find_surfaces(poses, position, c);
+MPM_HD void find_contact(bool wanted, const SlotPoses<T, D>& poses, const Vector<T, D>& position,
+                         NodeContact<T, D>& c) {
+  int k = NodeTouch<T, D>::none;
+  if (wanted) k = touch_of_node(poses, position).obstacle;
+  const bool several = k == NodeTouch<T, D>::several;
+  if (any_of_warp(several)) {
+    find_surfaces(several, poses, position, c);
+    join_warp();
+  }
+  if (several) return;
   c.position = position;
   MPM_UNROLL for (int i = 0; i < D; i++)
     c.sign[i] = T(1);
@@ -195,8 +200,8 @@ MPM_HD void find_contact(const SlotPoses<T, D>& poses, const Vector<T, D>& posit
 
 // Adds that of face i of a contact, whose obstacle has the given pose.
 template <class S, class T, int D>
-MPM_HD_CALL void add_face(const ObstaclePose<S, D>& pose, const NodeContact<T, D>& contact, int i,
-                          Constraints<S, D>& added) {
+MPM_HD void add_face(const ObstaclePose<S, D>& pose, const NodeContact<T, D>& contact, int i,
+                     Constraints<S, D>& added) {
   Constraint<S, D>& c = added.e[added.count++];
   T beyond;
   Vector<S, D> normal;
@@ -219,7 +224,7 @@ MPM_HD void add_constant(const Constraint<T, D>& c, Constraints<S, D>& added) {
 // The walls that a node meets beside obstacles keep the normal velocity that the grid update gave it. Sticky ones leave
 // the node to the obstacle.
 template <class S, class T, int D>
-MPM_HD_CALL void add_walls(const ContactArguments<T, D>& a, const NodeContact<T, D>& contact, Constraints<S, D>& c) {
+MPM_HD void add_walls(const ContactArguments<T, D>& a, const NodeContact<T, D>& contact, Constraints<S, D>& c) {
   for (int face = 0; face < 2 * D; face++) {
     if (!(contact.walls >> face & 1) || a.wall_kind[face] == Contact::sticky) continue;
     Constraint<S, D> wall;
@@ -236,8 +241,7 @@ MPM_HD_CALL void add_walls(const ContactArguments<T, D>& a, const NodeContact<T,
 }
 
 template <class T, int D>
-MPM_HD_CALL void find_constraints(const SlotPoses<T, D>& poses, const NodeContact<T, D>& contact,
-                                  Constraints<T, D>& c) {
+MPM_HD void find_constraints(const SlotPoses<T, D>& poses, const NodeContact<T, D>& contact, Constraints<T, D>& c) {
   c.count = 0;
   for (int i = 0; i < contact.count; i++) add_face(poses[contact.obstacle[i]], contact, i, c);
   add_walls(poses.a, contact, c);
@@ -250,25 +254,29 @@ MPM_HD Vector<T, D> reflected(const Vector<T, D>& sign, Vector<T, D> v) {
   return v;
 }
 
-// The velocity v of a node after contact with all surfaces that are near.
+// Replaces the velocity of a node by that after contact with all surfaces that are near.
 template <class T, int D>
-MPM_HD_CALL Vector<T, D> after_surfaces(const SlotPoses<T, D>& poses, const Vector<T, D>& position,
-                                        const Vector<T, D>& v) {
+MPM_HD_CALL void apply_surfaces(bool wanted, const SlotPoses<T, D>& poses, const Vector<T, D>& position,
+                                Vector<T, D>& v) {
+  if (!wanted) return;
   NodeContact<T, D> contact;
-  find_surfaces(poses, position, contact);
-  if (contact.count == 0) return v;
+  find_surfaces(true, poses, position, contact);
+  if (contact.count == 0) return;
   Constraints<T, D> constraints;
   find_constraints(poses, contact, constraints);
-  return reflected(contact.sign, after_constraints(constraints, reflected(contact.sign, v)));
+  v = reflected(contact.sign, after_constraints(constraints, reflected(contact.sign, v)));
 }
 
-// The same of any node.
+// The velocity v of a node after contact. By all threads of a warp, also of nodes that meet nothing.
 template <class T, int D>
 MPM_HD Vector<T, D> after_contact(const SlotPoses<T, D>& poses, const NodeTouch<T, D>& touch,
-                                  const Vector<T, D>& position, const Vector<T, D>& v) {
-  if (touch.obstacle == NodeTouch<T, D>::none) return v;
-  if (touch.obstacle == NodeTouch<T, D>::several) return after_surfaces(poses, position, v);
-  return touch.after(v);
+                                  const Vector<T, D>& position, Vector<T, D> v) {
+  const bool several = touch.obstacle == NodeTouch<T, D>::several;
+  if (any_of_warp(several)) {
+    apply_surfaces(several, poses, position, v);
+    join_warp();
+  }
+  return touch.obstacle >= 0 ? touch.after(v) : v;
 }
 
 // A node whose thread looks at it alone: the slot and its touch are found in one loop over the obstacles.
@@ -282,19 +290,32 @@ struct LoneNode {
     slot = contact_slot(a, scene, corner, nearest);
     touch = slot.near ? nearest.found(slot.walled) : NodeTouch<T, D>();
   }
-  MPM_HD Vector<T, D> after(const ContactArguments<T, D>& a, int local, const Vector<T, D>& v) const {
-    if (touch.obstacle == NodeTouch<T, D>::none) return v;
-    if (touch.obstacle != NodeTouch<T, D>::several) return touch.after(v);
-    return after_surfaces(SlotPoses<T, D>(a, slot), node_position(a, slot.corner, local), v);
+
+  // Replaces the velocity of the node by that after contact. By all threads of a warp, as `any_of_warp`.
+  MPM_HD void apply(bool wanted, const ContactArguments<T, D>& a, int local, Vector<T, D>& v) const {
+    const bool several = wanted && touch.obstacle == NodeTouch<T, D>::several;
+    if (any_of_warp(several)) {
+      apply_several(several, a, *this, local, v);
+      join_warp();
+    }
+    if (wanted && touch.obstacle >= 0) v = touch.after(v);
+  }
+
+ private:
+  MPM_HD_CALL static void apply_several(bool wanted, const ContactArguments<T, D>& a, const LoneNode& node, int local,
+                                        Vector<T, D>& v) {
+    if (!wanted) return;
+    apply_surfaces(true, SlotPoses<T, D>(a, node.slot), node_position(a, node.slot.corner, local), v);
   }
 };
 
+// Replaces the velocity of a node by that after contact. By all threads of a warp, as `any_of_warp`.
 template <class T, int D>
-MPM_HD Vector<T, D> after_contact(const ContactArguments<T, D>& a, int scene, const int (&corner)[D], int local,
-                                  const Vector<T, D>& v) {
+MPM_HD void apply_contact(bool wanted, const ContactArguments<T, D>& a, int scene, const int (&corner)[D], int local,
+                          Vector<T, D>& v) {
   LoneNode<T, D> node;
-  node.find(a, scene, corner, local);
-  return node.after(a, local, v);
+  if (wanted) node.find(a, scene, corner, local);
+  node.apply(wanted, a, local, v);
 }
 
 // ---- passes over the nodes of a slot
@@ -326,32 +347,37 @@ MPM_HD void slot_contact(const ContactArguments<T, D>& a, int slot, int lane) {
   const SlotPoses<T, D> poses(a, slot);
   const ContactSlot<T, D>& s = poses.s;
   const int64_t first = int64_t(slot) * kBlockNodes<D>;
-  if (s.near == 0) {
-    for (int local = lane; local < kBlockNodes<D>; local += Lanes)
-      store_node(a.result, first + local, load_node<T, D>(a.velocity, a.stride, first + local));
-    return;
-  }
-  for (int local = lane; local < kBlockNodes<D>; local += Lanes) {
-    Vector<T, D> v = load_node<T, D>(a.velocity, a.stride, first + local);
-    if (may_meet(a, s, first + local)) {
-      const Vector<T, D> position = node_position(a, s.corner, local);
-      v = after_contact(poses, touch_of_node(poses, position), position, v);
-    }
-    store_node(a.result, first + local, v);
+  for (int n = 0; n < kBlockNodes<D> / Lanes; n++) {
+    const int local = lane + n * Lanes;
+    const Vector<T, D> position = node_position(a, s.corner, local);
+    NodeTouch<T, D> touch;
+    if (may_meet(a, s, first + local)) touch = touch_of_node(poses, position);
+    store_node(a.result, first + local,
+               after_contact(poses, touch, position, load_node<T, D>(a.velocity, a.stride, first + local)));
   }
 }
 
-// Calls put(k, taken) with the velocity that each obstacle takes from a node of velocity v. What walls give beside
-// obstacles counts as that of the first.
-template <class T, int D, class Put>
-MPM_HD void taken_by_obstacles(const SlotPoses<T, D>& poses, const NodeContact<T, D>& contact, const Vector<T, D>& v,
-                               Put&& put) {
+// The velocities that obstacles take from a node. What walls give beside obstacles counts as that of the first.
+template <class T, int D>
+struct TakenVelocities {
+  int count = 0;
+  int obstacle[Constraints<T, D>::most];
+  Vector<T, D> taken[Constraints<T, D>::most];
+};
+
+template <class T, int D>
+MPM_HD_CALL void find_taken(bool wanted, const SlotPoses<T, D>& poses, const NodeContact<T, D>& contact,
+                            const Vector<T, D>& v, TakenVelocities<T, D>& result) {
+  if (!wanted) return;
   Constraints<T, D> c;
   find_constraints(poses, contact, c);
   Vector<T, D> change[Constraints<T, D>::most];
   changes_of_constraints<T, D>(c, reflected(contact.sign, v), change);
-  for (int i = 0; i < c.count; i++)
-    put(c.e[i].owner < 0 ? c.e[0].owner : c.e[i].owner, T(-1) * reflected(contact.sign, change[i]));
+  result.count = c.count;
+  for (int i = 0; i < c.count; i++) {
+    result.obstacle[i] = c.e[i].owner < 0 ? c.e[0].owner : c.e[i].owner;
+    result.taken[i] = T(-1) * reflected(contact.sign, change[i]);
+  }
 }
 
 // ---- adjoints
@@ -365,8 +391,8 @@ struct NodeAdjoint {
 
 // Derivative of the adjoint's scalar along a direction, from the constraints and the velocity as dual numbers.
 template <class T, int D>
-MPM_HD_CALL T directional_derivative(const Constraints<Dual<T>, D>& c, const NodeContact<T, D>& contact,
-                                     const Vector<Dual<T>, D>& v, const NodeAdjoint<T, D>& node) {
+MPM_HD T directional_derivative(const Constraints<Dual<T>, D>& c, const NodeContact<T, D>& contact,
+                                const Vector<Dual<T>, D>& v, const NodeAdjoint<T, D>& node) {
   Vector<Dual<T>, D> change[Constraints<Dual<T>, D>::most];
   changes_of_constraints<Dual<T>, D>(c, v, change);
   T sum = T(0);
@@ -378,29 +404,28 @@ MPM_HD_CALL T directional_derivative(const Constraints<Dual<T>, D>& c, const Nod
   return sum;
 }
 
-// Adjoint of the velocity before contact.
+// Adds what contact adds to the adjoint of the velocity before it.
 template <class T, int D>
-MPM_HD_CALL Vector<T, D> velocity_adjoint(const SlotPoses<T, D>& poses, const NodeContact<T, D>& contact,
-                                          const NodeAdjoint<T, D>& node) {
+MPM_HD_CALL void add_velocity_adjoint(bool wanted, const SlotPoses<T, D>& poses, const NodeContact<T, D>& contact,
+                                      const NodeAdjoint<T, D>& node, Vector<T, D>& result) {
+  if (!wanted) return;
   using S = Dual<T>;
   Constraints<T, D> values;
   find_constraints(poses, contact, values);
   Constraints<S, D> c;
   for (int i = 0; i < values.count; i++) add_constant(values.e[i], c);
-  Vector<T, D> result = node.grad;
   for (int axis = 0; axis < D; axis++) {
     Vector<S, D> v;
     MPM_UNROLL for (int i = 0; i < D; i++)
       v[i] = S(contact.sign[i] * node.before[i], i == axis ? contact.sign[i] : T(0));
     result[axis] += directional_derivative(c, contact, v, node);
   }
-  return result;
 }
 
 // Adjoint of a parameter of an obstacle by a node that meets it.
 template <class T, int D>
-MPM_HD_CALL T parameter_adjoint(const SlotPoses<T, D>& poses, const NodeContact<T, D>& contact, int k, int parameter,
-                                const NodeAdjoint<T, D>& node) {
+MPM_HD T parameter_adjoint(const SlotPoses<T, D>& poses, const NodeContact<T, D>& contact, int k, int parameter,
+                           const NodeAdjoint<T, D>& node) {
   using S = Dual<T>;
   const auto& a = poses.a;
   ObstacleRow<S, D> row;
@@ -425,48 +450,81 @@ MPM_HD_CALL T parameter_adjoint(const SlotPoses<T, D>& poses, const NodeContact<
   return directional_derivative(c, contact, v, node);
 }
 
+// Nodes of a slot that one lane looks at.
+template <int Lanes, class T, int D>
+struct LaneNodes {
+  static constexpr int count = kBlockNodes<D> / Lanes;
+  NodeContact<T, D> contact[count];
+  NodeAdjoint<T, D> adjoint[count];
+};
+
+// Sets the adjoint of a node after contact and by the impulses on obstacles; the adjoint of its mass. By all threads of
+// a warp, as `any_of_warp`.
+template <class T, int D, class Impulses>
+MPM_HD T set_adjoint(const SlotPoses<T, D>& poses, const NodeContact<T, D>& contact, const Vector<int, D>& at,
+                     const Impulses& impulses, NodeAdjoint<T, D>& node) {
+  for (int i = 0; i < contact.count; i++) node.weight[i] = node.grad;
+  T mass_grad = T(0);
+  if constexpr (Impulses::wanted) {
+    for (int i = 0; i < contact.count; i++)
+      node.weight[i] = node.grad + (T(0) - impulses.mass) * impulses.weight(contact.obstacle[i], at);
+    if (any_of_warp(contact.count > 0)) {
+      TakenVelocities<T, D> taken;
+      find_taken(contact.count > 0, poses, contact, node.before, taken);
+      join_warp();
+      for (int i = 0; i < taken.count; i++) mass_grad += dot(impulses.weight(taken.obstacle[i], at), taken.taken[i]);
+    }
+  }
+  return mass_grad;
+}
+
+// Adds the adjoint of the parameters of obstacle k by the nodes of a lane.
+template <int Lanes, class T, int D>
+MPM_HD_CALL void add_row_adjoint(bool wanted, const SlotPoses<T, D>& poses, const LaneNodes<Lanes, T, D>& nodes, int k,
+                                 T (&sum)[ObstacleRow<T, D>::width]) {
+  for (int n = 0; wanted && n < nodes.count; n++) {
+    if (!nodes.contact[n].meets(k)) continue;
+    for (int i = 0; i < ObstacleRow<T, D>::width; i++)
+      sum[i] += parameter_adjoint(poses, nodes.contact[n], k, i, nodes.adjoint[n]);
+  }
+}
+
 // `sum_lanes` adds a number over the lanes of a slot; the first lane gets the sum. `impulses(scene, node)` are
 // `NodeImpulses` of a node, or `NoImpulses`.
 template <int Lanes, class T, int D, class SumLanes, class ImpulsesOf>
 MPM_HD void slot_contact_backward(const ContactArguments<T, D>& a, int slot, int lane, SumLanes&& sum_lanes,
                                   ImpulsesOf&& impulses) {
-  constexpr int count = kBlockNodes<D> / Lanes, width = ObstacleRow<T, D>::width;
-  constexpr bool with_impulses = decltype(impulses(0, 0))::wanted;
+  constexpr int width = ObstacleRow<T, D>::width;
   const SlotPoses<T, D> poses(a, slot);
   const ContactSlot<T, D>& s = poses.s;
-  const int64_t first = int64_t(slot) * kBlockNodes<D> + lane;
-  NodeContact<T, D> contact[count];
-  NodeAdjoint<T, D> node[count];
-  for (int n = 0; n < count; n++) {
-    const Vector<T, D> grad = load_node<T, D>(a.grad, a.grad_stride, first + n * Lanes);
-    Vector<T, D> result = grad;
-    T mass_grad = T(0);
-    if (may_meet(a, s, first + n * Lanes))
-      find_contact(poses, node_position(a, s.corner, lane + n * Lanes), contact[n]);
-    if (contact[n].count > 0) {
-      node[n].before = load_node<T, D>(a.velocity, a.stride, first + n * Lanes);
-      node[n].grad = grad;
-      for (int i = 0; i < contact[n].count; i++) node[n].weight[i] = grad;
-      if constexpr (with_impulses) {
-        const auto own = impulses(s.scene, first + n * Lanes);
-        const Vector<int, D> at = lattice_node<D>(s.corner, lane + n * Lanes);
-        for (int i = 0; i < contact[n].count; i++)
-          node[n].weight[i] = grad + (T(0) - own.mass) * own.weight(contact[n].obstacle[i], at);
-        taken_by_obstacles(poses, contact[n], node[n].before,
-                           [&](int k, const Vector<T, D>& taken) { mass_grad += dot(own.weight(k, at), taken); });
-      }
-      result = velocity_adjoint(poses, contact[n], node[n]);
+  const int64_t first = int64_t(slot) * kBlockNodes<D>;
+  LaneNodes<Lanes, T, D> nodes;
+  for (int n = 0; n < nodes.count; n++) {
+    const int local = lane + n * Lanes;
+    NodeContact<T, D>& contact = nodes.contact[n];
+    NodeAdjoint<T, D>& node = nodes.adjoint[n];
+    find_contact(may_meet(a, s, first + local), poses, node_position(a, s.corner, local), contact);
+    node.before = load_node<T, D>(a.velocity, a.stride, first + local);
+    node.grad = load_node<T, D>(a.grad, a.grad_stride, first + local);
+    Vector<T, D> result = node.grad;
+    const T mass_grad =
+        set_adjoint(poses, contact, lattice_node<D>(s.corner, local), impulses(s.scene, first + local), node);
+    if (any_of_warp(contact.count > 0)) {
+      add_velocity_adjoint(contact.count > 0, poses, contact, node, result);
+      join_warp();
     }
-    store_node(a.result, first + n * Lanes, result, mass_grad);
+    store_node(a.result, first + local, result, mass_grad);
   }
   for (int k = 0; a.row_grad && k < a.obstacles; k++) {
     const bool near = s.near >> k & 1;
+    T sum[width] = {};
+    if (any_of_warp(near)) {
+      add_row_adjoint(near, poses, nodes, k, sum);
+      join_warp();
+    }
     for (int i = 0; i < width; i++) {
-      T sum = T(0);
-      for (int n = 0; near && n < count; n++)
-        if (contact[n].meets(k)) sum += parameter_adjoint(poses, contact[n], k, i, node[n]);
-      if (near) sum = sum_lanes(sum);
-      if (lane == 0) a.row_grad[(int64_t(slot) * a.obstacles + k) * width + i] = sum;
+      const T total = sum_lanes(sum[i]);
+      if (lane == 0) a.row_grad[(int64_t(slot) * a.obstacles + k) * width + i] = total;
     }
   }
 }

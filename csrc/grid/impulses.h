@@ -51,27 +51,32 @@ MPM_HD void slot_wall_impulses(const WallImpulsesArguments<T, D>& a, int slot, i
 // The same for obstacles, of velocities before contact.
 template <int Lanes, class T, int D, class Put>
 MPM_HD void slot_contact_impulses(const ContactImpulsesArguments<T, D>& a, int slot, int lane, Put&& put) {
-  constexpr int count = kBlockNodes<D> / Lanes;
   const ContactArguments<T, D>& c = a.contact;
   const SlotPoses<T, D> poses(c, slot);
   const ContactSlot<T, D>& s = poses.s;
-  if (!s.active || s.scene >= a.impulse.scenes) return;
-  const int64_t first = int64_t(slot) * kBlockNodes<D> + lane;
-  NodeContact<T, D> contact[count];
-  for (int n = 0; n < count; n++)
-    if (s.near && a.mass[(first + n * Lanes) * a.mass_stride] != T(0))
-      find_contact(poses, node_position(c, s.corner, lane + n * Lanes), contact[n]);
-  for (uint64_t left = s.near; left; left &= left - 1) {
+  const bool acts = s.near && s.scene < a.impulse.scenes;
+  const int64_t first = int64_t(slot) * kBlockNodes<D>;
+  constexpr int count = kBlockNodes<D> / Lanes;
+  TakenVelocities<T, D> taken[count];
+  for (int n = 0; n < count; n++) {
+    const int local = lane + n * Lanes;
+    NodeContact<T, D> contact;
+    find_contact(acts && a.mass[(first + local) * a.mass_stride] != T(0), poses, node_position(c, s.corner, local),
+                 contact);
+    if (any_of_warp(contact.count > 0)) {
+      find_taken(contact.count > 0, poses, contact, load_node<T, D>(c.velocity, c.stride, first + local), taken[n]);
+      join_warp();
+    }
+  }
+  for (uint64_t left = acts ? s.near : 0; left; left &= left - 1) {
     const int k = lowest_bit(left);
     ImpulseSum<D> sum;
     for (int n = 0; n < count; n++) {
-      if (!contact[n].meets(k)) continue;
-      const T mass = a.mass[(first + n * Lanes) * a.mass_stride];
-      const Vector<double, D> at = lattice_position(a.impulse, lattice_node<D>(s.corner, lane + n * Lanes));
-      taken_by_obstacles(poses, contact[n], load_node<T, D>(c.velocity, c.stride, first + n * Lanes),
-                         [&](int owner, const Vector<T, D>& taken) {
-                           if (owner == k) sum.add(at, mass * taken);
-                         });
+      const int local = lane + n * Lanes;
+      for (int i = 0; i < taken[n].count; i++)
+        if (taken[n].obstacle[i] == k)
+          sum.add(lattice_position(a.impulse, lattice_node<D>(s.corner, local)),
+                  a.mass[(first + local) * a.mass_stride] * taken[n].taken[i]);
     }
     put(s.scene, k, sum);
   }

@@ -318,16 +318,15 @@ MPM_HD Vector<S, D> velocity_at(const ObstaclePose<S, D>& o, const Vector<ValueO
 // ---- the faces of a shape, which contact of several obstacles looks at one by one
 
 // A box has 2 D flat faces, a revolved shape one for each edge of its polygon, any other shape its whole surface.
-template <class T, int D>
-MPM_HD int face_count(const ObstaclePose<T, D>& o) {
+template <int D>
+MPM_HD int face_count(const ObstacleKind& o) {
   return o.shape == ObstacleShape::box ? 2 * D : o.shape == ObstacleShape::revolved ? o.numbers / 2 : 1;
 }
 
 // Whether the height above a face is linear in the position.
-template <class T, int D>
-MPM_HD bool is_flat(const ObstaclePose<T, D>& o) {
-  return o.shape == ObstacleShape::box || o.shape == ObstacleShape::plane ||
-         (o.shape == ObstacleShape::revolved && D == 2);
+template <int D>
+MPM_HD bool is_flat(ObstacleShape shape) {
+  return shape == ObstacleShape::box || shape == ObstacleShape::plane || (shape == ObstacleShape::revolved && D == 2);
 }
 
 // Height of a point (distance from the axis, position along it) above the line of edge k of a polygon; `beyond` is how

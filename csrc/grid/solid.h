@@ -165,6 +165,18 @@ class SlotPoses {
 #endif
 };
 
+// Height of a point of the world above the surface that carries a face of obstacle k, and the unit normal of that; see
+// `face_height`.
+template <class T, int D>
+MPM_HD_CALL T height_above(const SlotPoses<T, D>& poses, int k, int face, const Vector<T, D>& x, Vector<T, D>& normal,
+                           T& beyond) {
+  const auto& pose = poses[k];
+  Vector<T, D> own;
+  const T height = face_height(pose, face, to_body(pose, x), own, beyond);
+  normal = pose.rotation * own;
+  return height;
+}
+
 // ---- faces near a node
 
 // A face and the point where its normal is read. The height of other points is read there too, or is that above the
@@ -214,29 +226,10 @@ class SolidAt {
   }
 
   // Finds the faces that the node meets; their number is zero where none is near enough.
-  MPM_HD_CALL void find() {
+  MPM_HD void find() {
     for (uint64_t left = poses_.s.near; left; left &= left - 1) add_faces(lowest_bit(left));
     Foot<T, D> foot;
-    foot.count = 1;
-    for (int i = 0; i < faces_.count && !is_deeper(i); i++) {
-      foot.member[0] = i;
-      try_foot(foot);
-    }
-    foot.count = 2;
-    for (int i = 0; i < faces_.count && !is_deeper(i); i++)
-      for (int j = 0; j < i; j++) {
-        foot.member[0] = j, foot.member[1] = i;
-        try_foot(foot);
-      }
-    if constexpr (D == 3) {
-      foot.count = 3;
-      for (int i = 0; i < faces_.count && !is_deeper(i); i++)
-        for (int j = 0; j < i; j++)
-          for (int k = 0; k < j; k++) {
-            foot.member[0] = k, foot.member[1] = j, foot.member[2] = i;
-            try_foot(foot);
-          }
-    }
+    while (next_set(foot)) try_foot(foot);
   }
 
   MPM_HD const Foot<T, D>& foot() const { return best_; }
@@ -245,7 +238,7 @@ class SolidAt {
  private:
   // In order, as `goes_before` has it; the last one makes room. Of several sticky ones the first gives the node its
   // velocity.
-  MPM_HD_CALL void add(Face<T, D>& face) {
+  MPM_HD void add(Face<T, D>& face) {
     face.rounded = rounded_depth(a_, face.depth);
     int at = faces_.count < kMostFaces ? faces_.count++ : kMostFaces;
     for (; at > 0 && goes_before(face, faces_.e[at - 1]); at--)
@@ -255,7 +248,7 @@ class SolidAt {
 
   // An order that does not depend on that of obstacles and outlines: the nearest face, the stricter one, that of more
   // friction, and by the normal.
-  MPM_HD_CALL bool goes_before(const Face<T, D>& face, const Face<T, D>& other) const {
+  MPM_HD bool goes_before(const Face<T, D>& face, const Face<T, D>& other) const {
     if (face.rounded != other.rounded) return face.rounded < other.rounded;
     const int kind = int(a_.kind[face.obstacle].contact), known = int(a_.kind[other.obstacle].contact);
     if (kind != known) return kind < known;
@@ -265,7 +258,7 @@ class SolidAt {
   }
 
   // By the sizes of components, as a box alone has it, and then by their signs; equal where these are nearly so.
-  MPM_HD_CALL static bool is_greater(const V& x, const V& y) {
+  MPM_HD static bool is_greater(const V& x, const V& y) {
     for (int i = 0; i < D; i++) {
       const T size = rounded_component(abs(x[i])), other = rounded_component(abs(y[i]));
       if (size != other) return size > other;
@@ -278,33 +271,48 @@ class SolidAt {
   }
   MPM_HD static T rounded_component(const T& x) { return std::floor(x * T(1000) + T(0.5)); }
 
+  // The next set of faces, in the order of their number, of the deepest one, the second one and so on. Sets whose
+  // deepest face is deeper than the best foot are left out.
+  MPM_HD bool next_set(Foot<T, D>& foot) const {
+    int at = 0;
+    while (at < foot.count && foot.member[at] + 1 == (at + 1 < foot.count ? foot.member[at + 1] : faces_.count)) at++;
+    const bool ends = at == foot.count || (at == foot.count - 1 && is_deeper(foot.member[at] + 1));
+    if (ends && (foot.count == D || foot.count == faces_.count || is_deeper(foot.count))) return false;
+    if (ends)
+      at = foot.count++;
+    else
+      foot.member[at]++;
+    for (int i = 0; i < foot.count; i++)
+      if (i < at || ends) foot.member[i] = i;
+    return true;
+  }
+
   // Whether a foot on a face is deeper than the best one.
   MPM_HD bool is_deeper(int face) const { return best_.count > 0 && faces_.e[face].rounded > best_.depth; }
 
-  MPM_HD_CALL T height_of(const ObstaclePose<T, D>& pose, int face, const V& x, V& normal) const {
+  MPM_HD T height_of(int k, const V& x, V& normal) const {
     T beyond;
-    V own;
-    const T height = face_height(pose, face, to_body(pose, x), own, beyond);
-    normal = pose.rotation * own;
-    return height;
+    return height_above(poses_, k, -1, x, normal, beyond);
   }
 
-  MPM_HD_CALL void add_faces(int k) {
-    const auto& pose = poses_[k];
-    if (pose.shape == ObstacleShape::sampled) return add_by_distance(k);
-    const int count = face_count(pose);
-    if (pose.shape == ObstacleShape::box) {  // whose faces are all far where it is
+  MPM_HD ObstacleShape shape_of(int k) const { return a_.kind[k].shape; }
+
+  // Of a shape of samples, the way between them [m].
+  MPM_HD T spacing_of(int k) const { return a_.data[a_.kind[k].first_number + D]; }
+
+  MPM_HD void add_faces(int k) {
+    if (shape_of(k) == ObstacleShape::sampled) return add_by_distance(k);
+    const int count = face_count<D>(a_.kind[k]);
+    if (shape_of(k) == ObstacleShape::box) {  // whose faces are all far where it is
       V normal;
-      if (!(height_of(pose, -1, node_, normal) <= reach_)) return;
+      if (!(height_of(k, node_, normal) <= reach_)) return;
     }
     for (int f = 0; f < count; f++) {
-      Face<T, D> face{k, count == 1 ? -1 : f, is_flat(pose), node_, {}, T(0), T(0)};
+      Face<T, D> face{k, count == 1 ? -1 : f, is_flat<D>(shape_of(k)), node_, {}, T(0), T(0)};
       T beyond;
-      V own;
-      face.height = face_height(pose, face.face, to_body(pose, node_), own, beyond);
+      face.height = height_above(poses_, k, face.face, node_, face.normal, beyond);
       face.depth = T(0) - face.height;
       if (!(face.height <= seam_ / 2) || !(face.depth <= reach_) || beyond > reach_) continue;
-      face.normal = pose.rotation * own;
       if (dot(face.normal, face.normal) > T(0.5)) add(face);
     }
   }
@@ -312,59 +320,58 @@ class SolidAt {
   // Of a shape that is known by its distance alone, its surface, and the planes that free space sees around the point
   // nearest to the node: those of the faces that join there; and where that point is covered, or the node is beside the
   // shape, those that neighbours of the node see.
-  MPM_HD_CALL void add_by_distance(int k) {
-    const auto& pose = poses_[k];
+  MPM_HD void add_by_distance(int k) {
     Face<T, D> nearest{k, -1, false, node_, {}, T(0), T(0)};
-    nearest.height = height_of(pose, -1, node_, nearest.normal);
+    nearest.height = height_of(k, node_, nearest.normal);
     nearest.depth = T(0) - nearest.height;
     bool covered = nearest.height > a_.rounding && nearest.height <= reach_;
     if (nearest.height <= seam_ / 2 && nearest.depth <= reach_ && dot(nearest.normal, nearest.normal) > T(0.5)) {
-      const T spacing = pose.data[D], small = T(2.5) * seam_,
+      const T spacing = spacing_of(k), small = T(2.5) * seam_,
               away = T(1.5) * spacing > small ? T(1.5) * spacing : small;
       const V first = node_ + nearest.depth * nearest.normal;
       for (int i = 0; i < kLeaning; i++) {
         V normal;
-        const V at = seen_from(pose, first, nearest.normal, away, i);
-        const T height = height_of(pose, -1, at, normal);
+        const V at = seen_from(k, first, nearest.normal, away, i);
+        const T height = height_of(k, at, normal);
         // The plane that it sees goes through that point or behind it where faces join; it is before a rounded body.
         const bool joins = height + dot(normal, first + T(-1) * at) >= T(-0.5) * seam_;
         nearest.flat = nearest.flat || (height >= T(0) && joins && dot(normal, nearest.normal) < T(kSame));
       }
-      if (!nearest.flat || is_a_face(pose, first, nearest.normal)) add(nearest);
-      for (int i = 0; nearest.flat && i < kLeaning; i++)
-        add_plane(k, pose, seen_from(pose, first, nearest.normal, away, i));
-      covered = covered || is_covered(k, pose, first, nearest.normal);
+      if (!nearest.flat || is_a_face(k, first, nearest.normal)) add(nearest);
+      for (int i = 0; nearest.flat && i < kLeaning; i++) add_plane(k, seen_from(k, first, nearest.normal, away, i));
+      covered = covered || is_covered(k, first, nearest.normal);
     }
-    if (covered) add_seen_by_neighbours(k, pose);
+    if (covered) add_seen_by_neighbours(k);
   }
 
   // Whether a normal at a point of the surface is that of a face: at edges distances rise more slowly along it.
-  MPM_HD_CALL bool is_a_face(const ObstaclePose<T, D>& pose, const V& first, const V& normal) const {
+  MPM_HD bool is_a_face(int k, const V& first, const V& normal) const {
     V there;
-    return height_of(pose, -1, first + seam_ * normal, there) > T(0.8) * seam_;
+    return height_of(k, first + seam_ * normal, there) > T(0.8) * seam_;
   }
 
   // A point around a point of the surface; one behind a face is moved before it.
-  MPM_HD_CALL V seen_from(const ObstaclePose<T, D>& pose, const V& first, const V& axis, const T& away, int i) const {
+  MPM_HD V seen_from(int k, const V& first, const V& axis, const T& away, int i) const {
     const V at = first + away * leaning(axis, i);
     V normal;
-    const T height = height_of(pose, -1, at, normal);
+    const T height = height_of(k, at, normal);
     return height < T(0) ? at + (T(0.3) * away - height) * normal : at;
   }
 
-  MPM_HD_CALL void add_seen_by_neighbours(int k, const ObstaclePose<T, D>& pose) {
+  MPM_HD void add_seen_by_neighbours(int k) {
     constexpr int count = D == 2 ? 9 : 27;
+    const Matrix<T, D> rotation = poses_[k].rotation;
     for (int i = 1; i < count; i++) {
       V way;
       for (int j = 0, rest = i; j < D; j++, rest /= 3) way[j] = T(rest % 3 == 2 ? -1 : rest % 3);
-      add_plane(k, pose, node_ + reach_ * (pose.rotation * way));
+      add_plane(k, node_ + reach_ * (rotation * way));
     }
   }
 
   // The plane that a point outside the shape sees, unless one with that normal is known.
-  MPM_HD_CALL void add_plane(int k, const ObstaclePose<T, D>& pose, const V& at) {
+  MPM_HD void add_plane(int k, const V& at) {
     Face<T, D> face{k, -1, true, at, {}, T(0), T(0), true};
-    face.height = height_of(pose, -1, face.at, face.normal);
+    face.height = height_of(k, face.at, face.normal);
     face.depth = T(0) - (face.height + dot(face.normal, node_ + T(-1) * face.at));
     if (!(face.height >= T(0)) || !(dot(face.normal, face.normal) > T(0.5))) return;
     if (!(face.depth >= T(0) - seam_) || face.depth > reach_) return;
@@ -377,7 +384,7 @@ class SolidAt {
 
   // A unit vector, and directions at 55° to it, evenly around.
   static constexpr int kLeaning = D == 2 ? 3 : 7;
-  MPM_HD_CALL static V leaning(const V& axis, int i) {
+  MPM_HD static V leaning(const V& axis, int i) {
     if (i == 0) return axis;
     const T c = T(0.57357643635104616), s = T(0.81915204428899180);
     const int k = i - 1;
@@ -395,14 +402,15 @@ class SolidAt {
     }
   }
 
-  MPM_HD_CALL T height_at(const Face<T, D>& face, const V& x, V& normal) const {
+  MPM_HD T height_at(const Face<T, D>& face, const V& x, V& normal) const {
     normal = face.normal;
     if (face.flat) return face.height + dot(face.normal, x + T(-1) * face.at);
-    return height_of(poses_[face.obstacle], face.face, x, normal);
+    T beyond;
+    return height_above(poses_, face.obstacle, face.face, x, normal, beyond);
   }
 
   // The nearest point on all faces of a foot; false where there is none whose faces all stop the node.
-  MPM_HD_CALL bool solve(Foot<T, D>& foot) const {
+  MPM_HD bool solve(Foot<T, D>& foot) const {
     bool curved = false;
     for (int i = 0; i < foot.count; i++) curved = curved || !faces_.e[foot.member[i]].flat;
     foot.at = node_;
@@ -429,41 +437,40 @@ class SolidAt {
   }
 
   // Whether the faces are there on the side of the foot where they bound free space, and that is free.
-  MPM_HD_CALL bool is_exposed(const Foot<T, D>& foot) const {
+  MPM_HD bool is_exposed(const Foot<T, D>& foot) const {
     V normal;
     for (int i = 0; i < foot.count; i++) {
       const Face<T, D>& face = faces_.e[foot.member[i]];
-      const auto& pose = poses_[face.obstacle];
       T near = seam_ / 2;
-      if (pose.shape == ObstacleShape::sampled) {  // whose normal is not defined at an edge
+      if (shape_of(face.obstacle) == ObstacleShape::sampled) {  // whose normal is not defined at an edge
         normal = face.normal;
-        near = near + T(0.5) * pose.data[D];
+        near = near + T(0.5) * spacing_of(face.obstacle);
       } else {
         height_at(face, foot.at, normal);
       }
       const V beside = foot.at + seam_ * (foot.step + T(-1) * normal);
-      if (!(height_of(pose, -1, beside, normal) <= near)) return false;
+      if (!(height_of(face.obstacle, beside, normal) <= near)) return false;
     }
     return (foot.count == 1 || is_inner(foot)) && is_free(foot.at, foot.step);
   }
 
   // Whether the edge of a foot looks inwards, so that a point before all of its faces but one is in the body of that:
   // tangents of a rounded body meet outside. Of samples, which round edges; others do not get here.
-  MPM_HD_CALL bool is_inner(const Foot<T, D>& foot) const {
+  MPM_HD bool is_inner(const Foot<T, D>& foot) const {
     V normal[D], unused;
     for (int i = 0; i < foot.count; i++) height_at(faces_.e[foot.member[i]], foot.at, normal[i]);
     for (int i = 0; i < foot.count; i++) {
-      const auto& pose = poses_[faces_.e[foot.member[i]].obstacle];
-      if (pose.shape != ObstacleShape::sampled) continue;
+      const int k = faces_.e[foot.member[i]].obstacle;
+      if (shape_of(k) != ObstacleShape::sampled) continue;
       T gram[D][D], share[D];
       for (int j = 0; j < foot.count; j++) {
         share[j] = T(i == j);
-        for (int k = 0; k < foot.count; k++) gram[j][k] = dot(normal[j], normal[k]);
+        for (int l = 0; l < foot.count; l++) gram[j][l] = dot(normal[j], normal[l]);
       }
       if (!solve_definite<T, D>(gram, share, foot.count)) return false;
       V way = foot.step;  // of height −1 above face i and 1 above the others
       for (int j = 0; j < foot.count; j++) way = way + T(-2) * share[j] * normal[j];
-      if (height_of(pose, -1, foot.at + pose.data[D] * way, unused) > T(0)) return false;
+      if (height_of(k, foot.at + spacing_of(k) * way, unused) > T(0)) return false;
     }
     return true;
   }
@@ -471,18 +478,18 @@ class SolidAt {
   // Whether a step of the height of a seam from a point that is nearest to the node leads into another obstacle, a
   // wall, or deeper into its own obstacle. Values of an inexact distance rise there, even if that point is not on the
   // surface.
-  MPM_HD_CALL bool is_covered(int k, const ObstaclePose<T, D>& pose, const V& first, const V& normal) const {
+  MPM_HD bool is_covered(int k, const V& first, const V& normal) const {
     V unused;
-    const T rise = height_of(pose, -1, first + seam_ * normal, unused) - height_of(pose, -1, first, unused);
+    const T rise = height_of(k, first + seam_ * normal, unused) - height_of(k, first, unused);
     return !(rise > T(0.25) * seam_) || !is_free(first, normal, uint64_t(1) << k);
   }
 
   // Whether a step of the height of a seam from a point of surfaces leads into free space, but for some obstacles.
-  MPM_HD_CALL bool is_free(const V& at, const V& step, uint64_t but = 0) const {
+  MPM_HD bool is_free(const V& at, const V& step, uint64_t but = 0) const {
     V normal;
     const V free = at + seam_ * step;
     for (uint64_t left = poses_.s.near & ~but; left; left &= left - 1)
-      if (!(height_of(poses_[lowest_bit(left)], -1, free, normal) > seam_ / 2)) return false;
+      if (!(height_of(lowest_bit(left), free, normal) > seam_ / 2)) return false;
     constexpr double facing = 0.7;  // cosine above which a face looks at a wall
     for (int face = 0; face < 2 * D; face++) {
       if (a_.wall_kind[face] == Contact::open) continue;
@@ -493,7 +500,7 @@ class SolidAt {
   }
 
   // Keeps a foot where it is exposed and less deep than the best one; of equals, by `comes_first`.
-  MPM_HD_CALL bool try_foot(Foot<T, D>& foot) {
+  MPM_HD bool try_foot(Foot<T, D>& foot) {
     foot.depth = faces_.e[foot.member[foot.count - 1]].rounded;
     if (best_.count > 0 && foot.depth > best_.depth) return false;
     if (!solve(foot) || !is_exposed(foot)) return false;
@@ -504,7 +511,7 @@ class SolidAt {
 
   // Whether a foot as deep as the best one comes first, whatever the order of obstacles and outlines: by the number of
   // its faces, by the strictest of their kinds, by their largest friction, and by where it leads.
-  MPM_HD_CALL bool comes_first(const Foot<T, D>& foot) const {
+  MPM_HD bool comes_first(const Foot<T, D>& foot) const {
     if (foot.count != best_.count) return foot.count > best_.count;
     const int kind = strictest(foot), known = strictest(best_);
     if (kind != known) return kind < known;

@@ -43,12 +43,13 @@ struct Node {
   }
 };
 
+// By all threads of a warp, also of nodes that are not used.
 template <bool Obstacles, class T, int D>
-__device__ void take_node(const NextGridArguments<T, D>& a, const Node<T, D>& node) {
-  NodeRow<T, D> row = update_node(a.update, node.there, node.local, node.sums(a));
-  if constexpr (Obstacles) {
-    if (row.mass != T(0)) row.value = node.contact.after(a.contact, node.local, row.value);
-  }
+__device__ void take_node(bool used, const NextGridArguments<T, D>& a, const Node<T, D>& node) {
+  NodeRow<T, D> row{T(0), zero_vector<T, D>()};
+  if (used) row = update_node(a.update, node.there, node.local, node.sums(a));
+  if constexpr (Obstacles) node.contact.apply(row.mass != T(0), a.contact, node.local, row.value);
+  if (!used) return;
   if (a.watched && goes_far(a.update, node.there, row)) atomicOr(&a.watched->lost, Displacement::kLost);
   a.update.updated[node.row()] = row;
   if (a.emptied) NodeRows<T, D>::empty(a.emptied, node.row(), a.fixed);
@@ -73,17 +74,19 @@ __global__ void __launch_bounds__(kThreads) next_grid_kernel(const __grid_consta
     *a.next_displacement = a.displacement->next(a.particles);
     if (a.items_taken) *a.items_taken = 0;
   }
-  for (int slot = first; slot < a.update.max_blocks; slot += stride) {
-    if (slot != found) {
+  for (int slot = first; any_of_warp(slot < a.update.max_blocks); slot += stride) {
+    const bool exists = slot < a.update.max_blocks;
+    if (exists && slot != found) {
       node.find(a, slot);
       if (Obstacles && node.is_in_use() && node.sums(a).mass != T(0)) node.find_obstacles(a);
     }
-    if (node.is_in_use())
-      take_node<Obstacles>(a, node);
-    else if (slot < a.near_blocks)
+    const bool used = exists && node.is_in_use();
+    take_node<Obstacles>(used, a, node);
+    if (used) continue;
+    if (slot < a.near_blocks)
       slot += (a.near_blocks - 1 - slot) / stride * stride;  // the next one may be of the margin
     else
-      break;
+      slot = a.update.max_blocks;
   }
 }
 

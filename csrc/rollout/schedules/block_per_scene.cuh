@@ -454,19 +454,22 @@ class SceneStep {
   }
 
   __device__ void update_nodes() const {
+    const int nodes = state.blocks * count, in_warps = (nodes + 31) / 32 * 32;
 #pragma unroll 1
-    for (int i = threadIdx.x; i < state.blocks * count; i += blockDim.x) {
+    for (int i = threadIdx.x; i < in_warps; i += blockDim.x) {
       const int slot = i / count, local = i % count;
-      NodeRow<T, D>& node = reinterpret_cast<NodeRow<T, D>*>(blocks.node)[i];
-      blocks.head[i] = Rows::end;
-      if (node.mass == T(0)) {
-        node = {T(0), zero_vector<T, D>()};
-        continue;
+      NodeRow<T, D>* const node = reinterpret_cast<NodeRow<T, D>*>(blocks.node) + i;
+      NodeRow<T, D> row{T(0), zero_vector<T, D>()};
+      SlotUpdate<T, D> there;
+      const bool has_mass = i < nodes && node->mass != T(0);
+      if (has_mass) {
+        there = slot_update(update, slot);
+        row = update_node(update, there, local, *node);
       }
-      const SlotUpdate<T, D> there = slot_update(update, slot);
-      NodeRow<T, D> row = update_node(update, there, local, node);
-      if (a.obstacles) row.value = after_contact(contact, there.scene, there.corner, local, row.value);
-      node = row;
+      if (a.obstacles) apply_contact(has_mass, contact, there.scene, there.corner, local, row.value);
+      if (i >= nodes) continue;
+      blocks.head[i] = Rows::end;
+      *node = row;
     }
     __syncthreads();
   }

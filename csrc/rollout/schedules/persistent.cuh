@@ -27,11 +27,15 @@ struct NodeVelocities {
   bool obstacles;
   NodeRows<T, D> nodes;
 
-  __device__ Vector<T, D> at(const SlotUpdate<T, D>& there, int slot, int local) const {
-    const NodeRow<T, D> node = nodes.at(int64_t(slot) * kBlockNodes<D> + local);
-    if (node.mass == T(0)) return zero_vector<T, D>();
-    const Vector<T, D> v = update_node(update, there, local, node).value;
-    return obstacles ? after_contact(contact, there.scene, there.corner, local, v) : v;
+  // By all threads of a warp; zero where not wanted.
+  __device__ Vector<T, D> at(bool wanted, const SlotUpdate<T, D>& there, int slot, int local) const {
+    NodeRow<T, D> node{T(0), zero_vector<T, D>()};
+    if (wanted) node = nodes.at(int64_t(slot) * kBlockNodes<D> + local);
+    const bool has_mass = node.mass != T(0);
+    Vector<T, D> v = zero_vector<T, D>();
+    if (has_mass) v = update_node(update, there, local, node).value;
+    if (obstacles) apply_contact(has_mass, contact, there.scene, there.corner, local, v);
+    return v;
   }
 };
 
@@ -199,12 +203,16 @@ class ItemStep {
   // Computes the velocities of the first nodes of the tile, and of the supports of `count` particles out of block.
   __device__ void load_velocities(const NodeVelocities<T, D>& velocities, NodeValue<T, D>* tile, int first_out_of_block,
                                   int of_tile, int count) const {
+    const int nodes = of_tile + count * support_nodes, in_warps = (nodes + 31) / 32 * 32;
 #pragma unroll 1
-    for (int i = threadIdx.x; i < of_tile + count * support_nodes; i += threads) {
+    for (int i = threadIdx.x; i < in_warps; i += threads) {
+      const bool exists = i < nodes;
       int offset[D], base = 0, place = i;
       const int* slots = m.slots;
       const bool is_out_of_block = i >= of_tile;
-      if (is_out_of_block) {
+      if (!exists) {
+        base = -1;
+      } else if (is_out_of_block) {
         const int s = (i - of_tile) / support_nodes;
         split<Order + 1>((i - of_tile) % support_nodes, offset);
         place = tile_nodes + s * span + in_tile(offset);
@@ -213,19 +221,18 @@ class ItemStep {
       } else {
         split<width>(i, offset);
       }
-      if (base < 0) continue;
+      const bool found = base >= 0;
       int node[D], neighbour = 0;
 #pragma unroll
       for (int axis = D - 1, rest = base; axis >= 0; axis--, rest /= kBlockWidth) {
         node[axis] = (is_out_of_block ? rest % kBlockWidth : 0) + offset[axis];
         neighbour |= (node[axis] >= kBlockWidth) << (D - 1 - axis);
       }
-      const int slot = slots[neighbour];
-      Vector<T, D> v = zero_vector<T, D>();
-      if (slot >= 0) {
-        const SlotUpdate<T, D> there = is_out_of_block ? slot_update(update, slot) : m.there[neighbour];
-        v = velocities.at(there, slot, node_in_block<D>(node));
-      }
+      const int slot = found ? slots[neighbour] : -1;
+      SlotUpdate<T, D> there;
+      if (slot >= 0) there = is_out_of_block ? slot_update(update, slot) : m.there[neighbour];
+      const Vector<T, D> v = velocities.at(slot >= 0, there, slot, node_in_block<D>(node));
+      if (!found) continue;
       NodeValue<T, D> value{};
 #pragma unroll
       for (int axis = 0; axis < D; axis++) value.e[axis] = v[axis];
