@@ -3,6 +3,7 @@
 import functools
 import itertools
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -405,19 +406,19 @@ def test_gradients_of_a_rollout_by_the_pose_are_those_of_differences(device, dim
 
 
 def any_shape(kind: int, dim: int, random: torch.Generator) -> shapes.Shape:
-    def numbers(low: float, high: float, *size: int) -> Tensor:
-        return low + (high - low) * torch.rand(size, generator=random, dtype=torch.float64)
+    def numbers(low: float, high: float, *size: int) -> Any:
+        return (low + (high - low) * torch.rand(size, generator=random, dtype=torch.float64)).tolist()
 
-    direction = unit(torch.randn(1, dim, generator=random, dtype=torch.float64))[0]
+    direction = unit(torch.randn(1, dim, generator=random, dtype=torch.float64))[0].tolist()
     match kind:
         case 0:
             return shapes.Plane(direction)
         case 1:
-            return shapes.Sphere(float(numbers(0.1, 0.35)))
+            return shapes.Sphere(numbers(0.1, 0.35))
         case 2:
             return shapes.Box(numbers(0.3, 0.8, dim))
         case 3:
-            return shapes.Capsule(0.3 * direction, float(numbers(0.1, 0.2)))
+            return shapes.Capsule([0.3 * d for d in direction], numbers(0.1, 0.2))
         case 4:
             return shapes.Revolved(CUP, direction)
     return sampled_cup(dim)
@@ -432,9 +433,9 @@ def any_obstacles(count: int, dim: int, random: torch.Generator) -> list[Obstacl
     found = []
     for _ in range(count):
         shape, kind = (int(torch.randint(n, (), generator=random)) for n in (6, 3))
-        turn = torch.randn((3,) if dim == 3 else (), generator=random, dtype=torch.float64)
-        at = 0.1 + 0.8 * torch.rand(dim, generator=random, dtype=torch.float64)
-        motion = {"velocity": torch.randn(dim, generator=random, dtype=torch.float64), "rotation": turn}
+        turn = torch.randn((3,) if dim == 3 else (), generator=random, dtype=torch.float64).tolist()
+        at = (0.1 + 0.8 * torch.rand(dim, generator=random, dtype=torch.float64)).tolist()
+        motion = {"velocity": torch.randn(dim, generator=random, dtype=torch.float64).tolist(), "rotation": turn}
         friction = 0.5 * float(torch.rand((), generator=random))
         kinds = ["sticky", "slip", "separate"]
         found.append(Obstacle(any_shape(shape, dim, random), at, kinds[kind], friction, **motion))

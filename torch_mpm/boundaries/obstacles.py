@@ -220,7 +220,7 @@ class Obstacle(RigidMotion):
                 "velocity and positions must both have shape [N, D], "
                 f"got {shape_of(velocity)} and {shape_of(positions)}"
             )
-        if positions.shape[0] == 0 or self._absent(scene, time):
+        if positions.shape[0] == 0 or self.is_absent(scene, time):
             return velocity
         after, _ = after_contact(velocity, SolidNodes([self], [None], positions, scene, time, None))
         return after
@@ -293,7 +293,7 @@ class Obstacle(RigidMotion):
 
         Arguments as `forward`. Differentiable; true near the surface, and away from it where the shape allows.
         """
-        if positions.shape[0] == 0 or self._absent(scene, time):
+        if positions.shape[0] == 0 or self.is_absent(scene, time):
             return positions.new_full(positions.shape[:1], torch.inf)
         arm, turn = self._arm_and_turn(positions, scene, time)
         distance = self.shape.signed_distance(to_body(turn, arm), scene)
@@ -306,7 +306,7 @@ class Obstacle(RigidMotion):
         Other arguments as `apply`.
         """
         velocity = None
-        if positions.shape[0] and not self._absent(scene, time):
+        if positions.shape[0] and not self.is_absent(scene, time):
             arm = positions - per_node(self.centre_at(time, positions), 1, scene)
             velocity = self.velocity_at(arm, scene, time)
         if velocity is None:
@@ -321,7 +321,8 @@ class Obstacle(RigidMotion):
         """Whether it moves, or comes or goes after the time zero."""
         return self.moves or self.start != 0 or self.end != math.inf
 
-    def _absent(self, scene: Tensor | None, time: float | Tensor) -> bool:
+    def is_absent(self, scene: Tensor | None, time: float | Tensor) -> bool:
+        """Whether it is nowhere, as far as that is known without reading a tensor; arguments as `forward`."""
         if scene is None and self.scene not in (None, 0):
             return True
         return not isinstance(time, Tensor) and not self.start <= time < self.end

@@ -28,9 +28,8 @@ REACH = 3.0
 """How far from free space nodes meet its faces, in dx."""
 SEAM = 0.1
 """Half of it, in dx, is the width of gaps and the height of steps that count as closed."""
-MOST_FACES, MOST_AT_ONCE = 12, 6
-"""Faces that a node looks at, the nearest ones; and where values may not be looked at, so that absent ones cost as much
-as others."""
+MOST_FACES, MOST_COMPILED = 12, 6
+"""Faces that a node looks at, the nearest ones; and in compiled functions, where absent ones cost as much as others."""
 FEET_AT_ONCE = 2**19
 """Feet that are computed together where values may not be looked at."""
 PASSES = 3
@@ -214,6 +213,8 @@ class Meeting:
         normal, velocity = torch.zeros_like(at), torch.zeros_like(at)
         for number, obstacle in enumerate(solid.obstacles):
             own = owner == number
+            if obstacle.is_absent(solid.scene, solid.time):
+                continue  # its pose may have no derivative
             if k > 0 and not (_may_join(solid.obstacles) and _may_be(own)):
                 continue
             mine = own[:, None]
@@ -513,7 +514,8 @@ def _feet(solid: SolidNodes, x: Tensor, distance: Tensor) -> tuple[Tensor, Tenso
                 whole[rows] = part
         return owner, face, at, foot
     distance = _without_others(solid, x, distance, around)
-    faces = _faces_near(solid, x, distance).nearest(MOST_FACES if skips else MOST_AT_ONCE, solid, x)
+    most = MOST_COMPILED if torch.compiler.is_compiling() else MOST_FACES
+    faces = _faces_near(solid, x, distance).nearest(most, solid, x)
     best = _Best(solid, faces, x)
     for count in range(1, dim + 1):
         reversed_groups = sorted(g[::-1] for g in itertools.combinations(range(faces.depth.shape[1]), count))
