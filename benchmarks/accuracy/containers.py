@@ -47,7 +47,7 @@ class Container:
     Attributes:
         obstacles: that make it.
         floor: height of the floor above the x, z of points [N, D] [m]: water starts above.
-        water: lower and upper corner of the box of water, of which what is in obstacles or below is left out.
+        water: lower and upper corner of the box of water. Particles in obstacles or below them are left out.
         column: middle and half of the width along x of a column that is open to the surface.
         walls: of the domain; none but for the reference.
     """
@@ -101,7 +101,7 @@ def _hopper(dim: int) -> list[Any]:
 
 
 def _channel(dim: int) -> list[Any]:
-    """A channel with an upright and a level arm, of which the step between them is a fourth box."""
+    """A channel with an upright and a level arm. A fourth box is the step between them."""
     half = 0.5 * SIDE
     parts = [*_tank(dim), _box((0.0, 0.1, -half)[:dim], (half, 2 * DEPTH, half)[:dim])]
     return parts

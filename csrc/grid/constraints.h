@@ -104,7 +104,7 @@ MPM_HD unsigned stopped_velocities(const Constraints<S, D>& c, const Vector<S, D
   return best;
 }
 
-// Friction along the surfaces of a set that stop λ: what it takes from a velocity v, in parts by surface.
+// Adds the change of a velocity v by friction along the surfaces of a set that stop λ, in parts by surface.
 template <class S, int D>
 MPM_HD void add_friction(const Constraints<S, D>& c, unsigned set, const S (&lambda)[Constraints<S, D>::most],
                          const Vector<S, D>& v, Vector<S, D> (&change)[Constraints<S, D>::most]) {

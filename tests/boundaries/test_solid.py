@@ -332,7 +332,7 @@ CUP = ((0.0, -0.3), (0.35, -0.3), (0.35, 0.2), (0.2, 0.2), (0.2, -0.1), (0.0, -0
 
 
 def with_curved_faces(form: str, dim: int, motion: dict[str, Tensor]) -> list[Obstacle]:
-    """Obstacles with inner edges, of which the last moves and turns and has friction."""
+    """Obstacles with inner edges. The last one moves, turns and has friction."""
     ball, rod = shapes.Sphere(0.25), shapes.Capsule([0.2, 0.05, 0.1][:dim], 0.15)
     floor = box([-0.1, 0.0, -0.1][:dim], [1.1, 0.4, 1.1][:dim], friction=0.2)
     match form:

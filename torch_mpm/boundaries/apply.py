@@ -33,7 +33,7 @@ def after_boundaries(
     *,
     impulses: bool = False,
 ) -> tuple[Tensor, list[Tensor]]:
-    """Node velocities after the boundaries, of which obstacles that are neighbours in the list act as one solid.
+    """Node velocities after the boundaries. Obstacles that are neighbours in the list act as one solid.
 
     Args:
         mass: of the nodes [N] [kg]. Obstacles leave nodes without mass alone.

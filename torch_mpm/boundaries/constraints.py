@@ -114,7 +114,7 @@ class Constraints:
             own = torch.stack([torch.full_like(is_there[:, i], i in members) for i in range(count)], 1)
             possible = (is_there | ~own).all(1)
             gram = self._gram(own & is_there)
-            possible = possible & _independent(gram)
+            possible = possible & independent(gram)
             gram = torch.where(possible[:, None, None], gram, torch.eye(count, dtype=gram.dtype, device=gram.device))
             stopped = _solve(gram, torch.where(own & possible[:, None], missing, 0))
             after = missing - ((stopped[:, :, None] * self.normal).sum(1)[:, None] * self.normal).sum(2)
@@ -148,7 +148,7 @@ def reads_values(x: Tensor) -> bool:
     return x.device.type == "cpu" and not torch.compiler.is_compiling()
 
 
-def _independent(gram: Tensor) -> Tensor:
+def independent(gram: Tensor) -> Tensor:
     """Where Gram matrices [n, C, C] are not nearly singular, bool [n]."""
     g, least = gram, gram[:, 0, 0]
     for k in range(gram.shape[1] - 1):

@@ -677,7 +677,7 @@ class _Best:
         return rounded(faces.depth.amax(1), self.solid.unit)
 
     def _rank(self, rows: Tensor, member: Tensor, step: Tensor) -> list[Tensor]:
-        """Numbers of feet [M], of which the least one comes first among equally deep ones, the first number first."""
+        """Numbers that order equally deep feet [M]. The least one comes first; ties compare the next number."""
         kind = self.kinds[rows[:, None], member].amin(1)
         friction = self.frictions[rows[:, None], member].amax(1)
         size, own = rounded(step.abs(), 1e-3), rounded(step, 1e-3)
@@ -778,7 +778,7 @@ def _solve(solid: SolidNodes, faces: _Candidates, x: Tensor) -> tuple[Tensor, Te
         height, normal = (torch.stack(part, 1) for part in zip(*heights, strict=True))
         rest = (normal * (at - x)[:, None]).sum(2) - height
         gram = normal @ normal.mT
-        independent = _least_pivot(gram) > 1e-3
+        independent = constraints.independent(gram)
         eye = torch.eye(count, dtype=gram.dtype, device=gram.device)
         gram = torch.where(independent[:, None, None], gram, eye)
         both = torch.linalg.solve_ex(gram, torch.stack([rest, torch.ones_like(rest)], 2))[0]
@@ -808,14 +808,3 @@ def _first_of_each(rows: Tensor, keys: Sequence[Tensor]) -> Tensor:
     is_first = torch.ones_like(ordered, dtype=torch.bool)
     is_first[1:] = ordered[1:] != ordered[:-1]
     return order[is_first]
-
-
-def _least_pivot(gram: Tensor) -> Tensor:
-    """The least pivot of the elimination of Gram matrices [N, n, n], [N]."""
-    g, least = gram, gram[:, 0, 0]
-    for k in range(gram.shape[1] - 1):
-        pivot = g[:, k, k]
-        safe = torch.where(pivot > 0, pivot, 1)
-        g = g - g[:, :, k, None] * g[:, None, k, :] / safe[:, None, None]
-        least = torch.minimum(least, g[:, k + 1, k + 1])
-    return least

@@ -72,7 +72,7 @@ def contact(
         walls: of the domain, which the obstacles may reach; the grid update has applied them. None for open faces.
         mass: of the nodes [N] [kg]; those without mass keep their velocity. None where all have mass.
 
-    More than `MAX_OBSTACLES` act in groups of so many, one after another.
+    Groups of `MAX_OBSTACLES` obstacles act one after another.
 
     Returns:
         Velocity [N, D] [m/s], a view of rows with stride 1 + D.
