@@ -104,6 +104,7 @@ FITTING: tuple[tuple[str, str, str, str], ...] = (
     ("seed[.]sphere", "center", "one more", "a sphere in 3-D"),
     ("Surface", "points", "axis 1", "a surface in 3-D"),
     ("contact", "velocity", "on meta", "a fake call"),
+    ("contact", "mass", "None", "optional"),
     ("substeps_arguments", "blocks", "None", "optional"),
     ("plan_rollout", "schedule|checkpoint", "None", "optional"),
     ("Step.failures", "state", "None", "optional"),

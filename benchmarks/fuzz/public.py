@@ -530,7 +530,7 @@ def _ops() -> dict[str, Callable[[], Call]]:
         "gather": on_blocks("gather", moment=True, gradient=True, moment_scale=2.0),
         "g2p_advance": on_blocks("g2p_advance", affine=True, stress_form="mls"),
         "grid_update": on_blocks("grid_update"),
-        "contact": on_blocks("contact"),
+        "contact": on_blocks("contact", mass=torch.ones(9 * 16)),
         "heat_operator": on_blocks("heat_operator", nodes=torch.ones(9 * 16)),
         "heat_cg": on_blocks(
             "heat_cg", tolerance=1e-3, max_iterations=20, method="cg", adjoint_tolerance=1e-3, relative_tolerance=0.0

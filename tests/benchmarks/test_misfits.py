@@ -15,7 +15,7 @@ from benchmarks.fuzz import calls, misfits, public
 RESULTS = (
     "Blocks", "DamagedFileError", "Failures", "Frames", "GridOverflowError", "HeatSolve", "Material",
     "FrontWarning", "LockingWarning", "Obstacle", "PrecisionWarning", "RolloutEstimate", "RolloutPlan",
-    "RolloutToResult", "SimulationError", "Trajectory",
+    "RolloutToResult", "SimulationError", "ThinWallWarning", "Trajectory",
 )  # fmt: skip
 """Classes that functions return or raise, and base classes."""
 CUDA_ALONE = ("captured", "make_graphed_step")

@@ -636,7 +636,7 @@ class _Best:
         """Feet on groups of as many faces each: those that are wanted where `reads_values` holds, else all, in parts
         that memory holds; at once in a compiled function, which parts would make long."""
         if constraints.reads_values(self.x):
-            self._consider_wanted(torch.tensor(groups))
+            self._consider_wanted(torch.tensor(groups, device=self.x.device))
             return
         size = len(groups) if torch.compiler.is_compiling() else max(1, FEET_AT_ONCE // max(1, len(self.x)))
         for first in range(0, len(groups), size):

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from ..boundaries import Face, Obstacle, Walls
 from ..boundaries.solid import SolidNodes, after_contact
-from ..errors import FLOATING, NUMBER_OR_TENSOR, check_number, shape_of
+from ..errors import FLOATING, NUMBER_OR_TENSOR, check_like, check_number, shape_of
 from ..geometry import shapes
 from ..grid.grid import Blocks, check_blocks
 from ..grid.topology import Topology
@@ -84,6 +84,7 @@ def contact(
     rotation, angular_velocity and friction of the obstacles and the normal, half_axis and axis of their shapes.
     """
     check_contact(blocks, velocity, obstacles)
+    check_like("mass", mass, velocity, (blocks.node_count,), "[N]")
     scene_time, number = time_arguments(time, velocity, blocks.grid.scenes)
     obstacles = present(obstacles, scene_time, number)
     for first in range(0, len(obstacles), MAX_OBSTACLES):
