@@ -26,6 +26,7 @@ def bounded(dim: int) -> list[shapes.Shape]:
         shapes.Capsule(axis, 0.3),
         shapes.Revolved(VASE, axis),
         shapes.Revolved(VASE),
+        shapes.Torus(axis, 0.3),
     ]
     return made + ([shapes.Cylinder(axis, 0.4)] if dim == 3 else [])
 
@@ -127,20 +128,44 @@ def test_any_shape_is_filled():
 
 
 def test_the_shape_of_the_docstring():
-    """It acts as an obstacle, and its distance is that to a ring."""
+    """It acts as an obstacle, and its distance is that to a tube."""
     text = shapes.__doc__.split("\n\n")[2]
     namespace = {"torch": torch, "Shape": shapes.Shape, "norm": mpm.vectors.norm, "unit": mpm.vectors.unit}
     exec(textwrap.dedent(text), namespace)
-    torus = namespace["Torus"](0.6, 0.2)
+    tube = namespace["Tube"](0.6, 0.2)
     x = sample(3, 1000).requires_grad_()
-    distance, normal = torus.surface(x)
-    angle = torch.linspace(0, 2 * torch.pi, 4001, dtype=torch.float64)
-    ring = 0.6 * torch.stack([angle.cos(), 0 * angle, angle.sin()], 1)
-    torch.testing.assert_close(distance, torch.cdist(x, ring).amin(1) - 0.2, rtol=0, atol=1e-5)
+    distance, normal = tube.surface(x)
+    outer = shapes.Revolved(((0.5, -9.0), (0.7, -9.0), (0.7, 9.0), (0.5, 9.0)))
+    torch.testing.assert_close(distance, outer.surface(x)[0], rtol=0, atol=1e-12)
     (gradient,) = torch.autograd.grad(distance.sum(), x)
     torch.testing.assert_close(normal, gradient, rtol=0, atol=1e-10)
-    stopped = Obstacle(torus, (0.0, 0.0, 0.0), "sticky").apply(torch.ones_like(x), x.detach(), None, 0.0, 0.1) == 0
+    stopped = Obstacle(tube, (0.0, 0.0, 0.0), "sticky").apply(torch.ones_like(x), x.detach(), None, 0.0, 0.1) == 0
     assert torch.equal(stopped.all(1), distance <= 0)
+
+
+def test_a_subclass_declares_its_own_surface():
+    """What a kernel, a scene file or a search for edges knows of a shape does not hold for another surface."""
+
+    class Cap(shapes.Sphere):
+        name = "cap"
+
+        def surface(self, x, scene=None):
+            return x[:, 1] - 0.1, torch.tensor([[0.0, 1.0]], dtype=x.dtype).expand_as(x)
+
+    cap = Cap(0.5)
+    assert (cap.number, cap.words, cap.is_smooth, cap.is_convex) == (None, None, False, False)
+    grid = mpm.Grid(0.1, (0.0, 0.0), (1.0, 1.0))
+    points = mpm.seed.Points(torch.tensor([[0.5, 0.55]], dtype=torch.float64), torch.tensor([0.01]).double())
+    step = mpm.Step(grid, mpm.NeoHookean(E=1e4, nu=0.3), boundaries=[Obstacle(cap, (0.5, 0.5), "sticky")])
+    moving = mpm.State.at_rest(points, 1000.0, velocity=(1.0, -1.0))
+    assert step(moving, 1e-3).v.abs().max() < 1e-12
+
+
+def test_a_torus_is_thinner_than_its_ring():
+    with pytest.raises(ValueError, match=r"radius must be below that of the circle, 0\.5 m, got 0\.5"):
+        shapes.Torus((0.0, 0.5), 0.5)
+    with pytest.raises(ValueError, match="ring must not be zero"):
+        shapes.Torus((0.0, 0.0), 0.5)
 
 
 def test_messages():

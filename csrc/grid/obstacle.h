@@ -8,10 +8,10 @@
 #include "grid/impulse.h"
 #include "grid/lattice_node.h"
 
-// Rigid obstacles: the arguments of contact, poses, and the distance and faces of shapes.
+// Rigid obstacles: the arguments of contact, and poses.
 namespace mpm {
 
-enum class ObstacleShape : int { plane = 0, sphere = 1, box = 2, capsule = 3, revolved = 4, sampled = 5 };
+enum class ObstacleShape : int;  // see grid/shapes.h
 
 constexpr int kMaxObstacles = 64;  // of one call
 
@@ -31,8 +31,8 @@ struct ObstacleRow {
   T friction;
   T position[D], velocity[D];                    // of the centre at time `start`
   T rotation[angles], angular_velocity[angles];  // an angle in 2-D, a vector in 3-D; about the centre
-  T extent[D];                                   // plane: normal; box: edge lengths; capsule: half axis; revolved: axis
-  T radius;                                      // of a sphere or capsule
+  T extent[D];                                   // the vector of its shape, and
+  T radius;                                      // the radius, see grid/shapes.h
   static constexpr int width = 3 * D + 2 * angles + 2;
 };
 
@@ -53,10 +53,7 @@ struct ContactArguments {
   // From there to the rows of the next substep of a call, where each has its own, with the positions of then; else
   // zero.
   int64_t step_stride = 0;
-  // Of a revolved shape, corners (distance from the axis, position along it), anticlockwise; of a sampled one, the
-  // first node of the samples [D], their distance, numbers of them along each axis [D], and the samples, the last axis
-  // fastest.
-  const T* data = nullptr;
+  const T* data = nullptr;             // numbers of the shapes that have many, see grid/shapes.h
   const double* scene_time = nullptr;  // [times], one for all scenes or one per scene; or null
   int times = 0;
   double time = 0;  // where scene_time is null, or
@@ -150,152 +147,6 @@ MPM_HD ObstaclePose<S, D> obstacle_pose(const ContactArguments<T, D>& a, const O
   return p;
 }
 
-// Signed distance of a point (distance from the axis, position along it) from a closed polygon, and the outward normal
-// of its nearest edge; among equals, the first counts. `second` is the distance of the edge that is nearest but for
-// this one.
-template <class S>
-MPM_HD S polygon_surface(const ValueOf<S>* corner, int corners, const Vector<S, 2>& p, Vector<S, 2>& normal,
-                         ValueOf<S>& second) {
-  using T = ValueOf<S>;
-  S nearest = S(std::numeric_limits<T>::max());
-  second = std::numeric_limits<T>::max();
-  normal = zero_vector<S, 2>();
-  bool inside = false;
-  for (int k = 0; k < corners; k++) {
-    const T *const a = corner + 2 * k, *const b = corner + 2 * (k + 1 < corners ? k + 1 : 0);
-    const Vector<S, 2> edge = {{lift<S>(b[0] - a[0]), lift<S>(b[1] - a[1])}};
-    const Vector<S, 2> arm = {{p[0] - lift<S>(a[0]), p[1] - lift<S>(a[1])}};
-    // An odd number of edges is crossed by the ray from the point away from the axis.
-    const S side = edge[0] * arm[1] - edge[1] * arm[0];
-    if ((a[1] > value_of(p[1])) != (b[1] > value_of(p[1])) && (edge[1] > S(0) ? side > S(0) : side < S(0)))
-      inside = !inside;
-    if (a[0] == T(0) && b[0] == T(0)) continue;  // an edge on the axis is inside the body
-    const S along = dot(arm, edge) / dot(edge, edge);
-    Vector<S, 2> offset;
-    if (!(along < S(1)))  // exactly as from the next edge
-      offset = {{p[0] - lift<S>(b[0]), p[1] - lift<S>(b[1])}};
-    else
-      offset = arm + (along > S(0) ? S(0) - along : S(0)) * edge;
-    const S distance = length(offset);
-    if (distance < nearest) {
-      second = value_of(nearest);
-      nearest = distance;
-      normal = direction(Vector<S, 2>{{edge[1], S(0) - edge[0]}});
-    } else if (value_of(distance) < second) {
-      second = value_of(distance);
-    }
-  }
-  return inside ? S(0) - nearest : nearest;
-}
-
-// Signed distance by multilinear interpolation of samples, and the direction of its gradient; beyond the samples the
-// distance there and the way to there are legs of a right triangle, so that it is a lower bound. Far away where the
-// numbers are not those of samples.
-template <class S, int D>
-MPM_HD S sampled_surface(const ValueOf<S>* data, int numbers, const Vector<S, D>& p, Vector<S, D>& normal) {
-  using T = ValueOf<S>;
-  normal = zero_vector<S, D>();
-  int64_t samples = numbers > 2 * D ? 1 : 0;
-  int count[D];
-  MPM_UNROLL for (int i = 0; i < D && samples; i++) {
-    const T n = data[D + 1 + i];
-    count[i] = n >= T(2) && n < T(1 << 20) ? int(n) : 0;
-    samples *= count[i];
-  }
-  if (samples == 0 || samples > numbers - (2 * D + 1)) return S(std::numeric_limits<T>::max());
-  const T spacing = data[D];
-  int cell[D];
-  Vector<S, D> weight, beyond;  // of the upper node
-  MPM_UNROLL for (int i = 0; i < D; i++) {
-    const S along = (p[i] - lift<S>(data[i])) / lift<S>(spacing);
-    const S last = lift<S>(T(count[i] - 1));
-    const S inside = along > S(0) ? (along < last ? along : last) : S(0);
-    cell[i] = int(value_of(inside));
-    if (cell[i] > count[i] - 2) cell[i] = count[i] - 2;
-    weight[i] = inside - lift<S>(T(cell[i]));
-    beyond[i] = (along - inside) * lift<S>(spacing);
-  }
-  S distance = S(0);
-  MPM_UNROLL for (int corner = 0; corner < 1 << D; corner++) {
-    int64_t index = 0;
-    S product = S(1);
-    MPM_UNROLL for (int i = 0; i < D; i++) {
-      const int upper = corner >> i & 1;
-      index = index * count[i] + cell[i] + upper;
-      product = product * (upper ? weight[i] : S(1) - weight[i]);
-    }
-    const S value = lift<S>(data[2 * D + 1 + index]);
-    distance = distance + product * value;
-    MPM_UNROLL for (int i = 0; i < D; i++) {
-      S slope = value;
-      MPM_UNROLL for (int j = 0; j < D; j++) {
-        const int upper = corner >> j & 1;
-        slope = slope * (j == i ? S(upper ? 1 : -1) : upper ? weight[j] : S(1) - weight[j]);
-      }
-      normal[i] = normal[i] + slope;
-    }
-  }
-  normal = direction(normal);
-  const S far = dot(beyond, beyond);
-  return far > S(0) ? sqrt(distance * distance + far) : distance;
-}
-
-// Signed distance of a point in body coordinates, and the unit normal out of the body: right inside, zero where the
-// shape has none. Outside, the distance is a lower bound. `second` is the distance of a second face of the shape, where
-// its faces may join at inner edges: the least number where they are not known one by one, and else the largest.
-template <class T, int D>
-MPM_HD T surface(const ObstaclePose<T, D>& o, const Vector<T, D>& body, Vector<T, D>& normal, ValueOf<T>& second) {
-  second = std::numeric_limits<ValueOf<T>>::max();
-  Vector<T, D> extent;
-  MPM_UNROLL for (int i = 0; i < D; i++)
-    extent[i] = o.row->extent[i];
-  if (o.shape == ObstacleShape::plane) {
-    normal = (T(1) / length(extent)) * extent;
-    return dot(body, normal);
-  }
-  if (o.shape == ObstacleShape::box) {  // the nearest face is that of the axis with the least negative distance
-    T deepest = T(0);
-    int axis = -1;
-    MPM_UNROLL for (int i = 0; i < D; i++) {
-      const T distance = abs(body[i]) - T(0.5) * extent[i];
-      if (axis < 0 || distance > deepest) deepest = distance, axis = i;
-    }
-    MPM_UNROLL for (int i = 0; i < D; i++)
-      normal[i] = i != axis ? T(0) : body[i] < T(0) ? T(-1) : T(1);
-    return deepest;
-  }
-  if (o.shape == ObstacleShape::revolved) {
-    const Vector<T, D> axis = direction(extent);
-    const T along = dot(body, axis);
-    const Vector<T, D> across = body + (T(0) - along) * axis;
-    Vector<T, 2> plane_normal;
-    const T distance =
-        polygon_surface(o.data, o.numbers / 2, Vector<T, 2>{{length(across), along}}, plane_normal, second);
-    normal = plane_normal[0] * direction(across) + plane_normal[1] * axis;
-    return distance;
-  }
-  if (o.shape == ObstacleShape::sampled) {
-    second = std::numeric_limits<ValueOf<T>>::lowest();
-    return sampled_surface(o.data, o.numbers, body, normal);
-  }
-  Vector<T, D> offset = body;
-  if (o.shape == ObstacleShape::capsule) {
-    const T squared = dot(extent, extent);
-    T along = squared > T(0) ? dot(body, extent) / squared : T(0);
-    along = along < T(-1) ? T(-1) : along > T(1) ? T(1) : along;
-    offset = body + (T(0) - along) * extent;
-  }
-  const T distance = length(offset);
-  normal = (distance > T(0) ? T(1) / distance : T(0)) * offset;
-  return distance - o.row->radius;
-}
-
-template <class T, int D>
-MPM_HD T surface(const ObstaclePose<T, D>& o, const Vector<T, D>& body, Vector<T, D>& normal) {
-  ValueOf<T> second;
-  return surface(o, body, normal, second);
-}
-
 // Velocity of an obstacle's matter at a position.
 template <class S, int D>
 MPM_HD Vector<S, D> velocity_at(const ObstaclePose<S, D>& o, const Vector<ValueOf<S>, D>& position) {
@@ -313,70 +164,6 @@ MPM_HD Vector<S, D> velocity_at(const ObstaclePose<S, D>& o, const Vector<ValueO
     }
   }
   return velocity;
-}
-
-// ---- the faces of a shape, which contact of several obstacles looks at one by one
-
-// A box has 2 D flat faces, a revolved shape one for each edge of its polygon, any other shape its whole surface.
-template <int D>
-MPM_HD int face_count(const ObstacleKind& o) {
-  return o.shape == ObstacleShape::box ? 2 * D : o.shape == ObstacleShape::revolved ? o.numbers / 2 : 1;
-}
-
-// Whether the height above a face is linear in the position.
-template <int D>
-MPM_HD bool is_flat(ObstacleShape shape) {
-  return shape == ObstacleShape::box || shape == ObstacleShape::plane || (shape == ObstacleShape::revolved && D == 2);
-}
-
-// Height of a point (distance from the axis, position along it) above the line of edge k of a polygon; `beyond` is how
-// far the foot of the point is beyond the ends of the edge. Far above where the edge is on the axis, inside the body.
-template <class S>
-MPM_HD S edge_height(const ValueOf<S>* corner, int corners, int k, const Vector<S, 2>& p, Vector<S, 2>& normal,
-                     ValueOf<S>& beyond) {
-  using T = ValueOf<S>;
-  const T *const a = corner + 2 * k, *const b = corner + 2 * (k + 1 < corners ? k + 1 : 0);
-  const Vector<S, 2> edge = {{lift<S>(b[0] - a[0]), lift<S>(b[1] - a[1])}};
-  const Vector<S, 2> arm = {{p[0] - lift<S>(a[0]), p[1] - lift<S>(a[1])}};
-  normal = direction(Vector<S, 2>{{edge[1], S(0) - edge[0]}});
-  const T size = value_of(length(edge)), along = size > T(0) ? value_of(dot(arm, edge)) / size : T(0);
-  beyond = along < T(0) ? T(0) - along : along > size ? along - size : T(0);
-  if (size == T(0) || (a[0] == T(0) && b[0] == T(0))) return S(std::numeric_limits<T>::max());
-  return dot(arm, normal);
-}
-
-// Height of a point in body coordinates above the surface that carries a face, and the unit normal of that; `beyond` is
-// about how far the foot of the point is from the face itself, as far as that is known. Face −1 is the nearest one, the
-// only one whose number `surface` needs.
-template <class S, int D>
-MPM_HD S face_height(const ObstaclePose<S, D>& o, int face, const Vector<S, D>& body, Vector<S, D>& normal,
-                     ValueOf<S>& beyond) {
-  using T = ValueOf<S>;
-  beyond = T(0);
-  if (face >= 0 && o.shape == ObstacleShape::box) {
-    const int axis = face / 2;
-    const S side = S(face % 2 ? 1 : -1);
-    MPM_UNROLL for (int i = 0; i < D; i++)
-      normal[i] = i == axis ? side : S(0);
-    S along = S(0), size = S(0);
-    MPM_UNROLL for (int i = 0; i < D; i++)
-      if (i == axis) along = side * body[i], size = o.row->extent[i];
-    return along - S(0.5) * size;
-  }
-  if (face >= 0 && o.shape == ObstacleShape::revolved) {
-    Vector<S, D> extent;
-    MPM_UNROLL for (int i = 0; i < D; i++)
-      extent[i] = o.row->extent[i];
-    const Vector<S, D> axis = direction(extent);
-    const S along = dot(body, axis);
-    const Vector<S, D> across = body + (S(0) - along) * axis;
-    Vector<S, 2> plane_normal;
-    const S height =
-        edge_height(o.data, o.numbers / 2, face, Vector<S, 2>{{length(across), along}}, plane_normal, beyond);
-    normal = plane_normal[0] * direction(across) + plane_normal[1] * axis;
-    return height;
-  }
-  return surface(o, body, normal);
 }
 
 // A point of the world in the coordinates of an obstacle.

@@ -4,7 +4,7 @@
 #include <cmath>
 #include <limits>
 
-#include "grid/obstacle.h"
+#include "grid/shapes.h"
 #include "grid/topology.op.h"
 
 // Obstacles as the ops take them, packed by torch_mpm/ops/contact.py and unpacked here.
@@ -81,8 +81,8 @@ ContactArguments<T, D> obstacle_arguments(const Tensor& like, const PackedLattic
   check_entries(end, "end");
   int64_t number = 0;
   for (size_t k = 0; k < count; k++) {
-    STD_TORCH_CHECK(shape[k] >= int64_t(ObstacleShape::plane) && shape[k] <= int64_t(ObstacleShape::sampled),
-                    "shape must be 0 to 5, got ", shape[k]);
+    STD_TORCH_CHECK(shape[k] >= 0 && shape[k] < int64_t(ObstacleShape::count), "shape must be below ",
+                    int64_t(ObstacleShape::count), " and not negative, got ", shape[k]);
     STD_TORCH_CHECK(sizes[k] >= 0 && sizes[k] <= INT32_MAX / kMaxObstacles,
                     "sizes must not be negative nor too large, got ", sizes[k]);
     STD_TORCH_CHECK(contact_kind[k] >= int64_t(Contact::sticky) && contact_kind[k] <= int64_t(Contact::separate),

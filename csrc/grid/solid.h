@@ -1,7 +1,7 @@
 #pragma once
 
 #include "grid/constraints.h"
-#include "grid/obstacle.h"
+#include "grid/shapes.h"
 
 // All obstacles of a scene as one solid: the surfaces that a node inside it meets.
 //

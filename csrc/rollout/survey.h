@@ -2,7 +2,7 @@
 
 #include "common/lanes.h"
 #include "grid/geometry.h"
-#include "grid/obstacle.h"
+#include "grid/shapes.h"
 
 // What a run asks of its particles between two steps: the limit of the time step, the speed, and whether all is well.
 namespace mpm {

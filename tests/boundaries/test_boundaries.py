@@ -37,11 +37,12 @@ def shapes(dim: int, **options: object) -> list[Obstacle]:
         mpm.Box(at, numbers(dim, 0.9, 0.5, 1.2), **options),
         mpm.Capsule(at, numbers(dim, 0.3, 0.4, -0.1), 0.35, **options),
         mpm.Revolved(at, HOLLOW, numbers(dim, 0.3, 1.0, -0.2), **options),
+        mpm.Obstacle(mpm.shapes.Torus(numbers(dim, 0.1, 0.5, -0.2), 0.3), at, **options),
         mpm.SDF(lambda x: (x * x).sum(1) - 0.4 + 0.3 * x[:, 0], at, **options),
     ]
 
 
-SHAPES = ["plane", "sphere", "box", "capsule", "revolved", "sdf"]
+SHAPES = ["plane", "sphere", "box", "capsule", "revolved", "torus", "sdf"]
 HOLLOW = ((0.15, -0.5), (0.45, 0.5), (0.7, 0.5), (0.7, -0.5))
 """A cylinder of radius 0.7 with a conical hole, clockwise."""
 
@@ -83,6 +84,10 @@ def inside_by_brute_force(shape: str, obstacle: Obstacle, positions: np.ndarray)
         along = body @ axis
         away = np.linalg.norm(body - along[:, None] * axis, axis=1)
         return (np.abs(along) <= 0.5) & (away <= 0.7) & (away >= 0.15 + 0.3 * (along + 0.5))
+    if shape == "torus":  # the quartic equation of its surface
+        squared, ring = (body**2).sum(1), np.array(sizes["ring"])
+        across = squared * (ring @ ring) - (body @ ring) ** 2
+        return (squared + ring @ ring - sizes["radius"] ** 2) ** 2 <= 4 * across
     return (body**2).sum(1) - 0.4 + 0.3 * body[:, 0] <= 0
 
 
@@ -300,6 +305,7 @@ def test_gradcheck(dim, shape, kind):
             "box": lambda: mpm.Box(size=(0.9,) * dim, **options),
             "capsule": lambda: mpm.Capsule(half_axis=extra, radius=0.3, **options),
             "revolved": lambda: mpm.Revolved(outline=HOLLOW, axis=extra, **options),
+            "torus": lambda: mpm.Obstacle(mpm.shapes.Torus(extra, 0.3), **options),
             "sdf": lambda: mpm.SDF(lambda x: (x * x * (1 + extra**2)).sum(1) - 0.5, **options),
         }[shape]()
         return act(obstacle, velocity, positions, time=0.2)

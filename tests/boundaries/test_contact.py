@@ -34,10 +34,11 @@ def shapes(dim: int, **options: object) -> list[Obstacle]:
         mpm.Box(at, vector(dim, 0.5, 0.3, 0.6), **options),
         mpm.Capsule(at, vector(dim, 0.15, 0.2, -0.1), 0.15, **options),
         mpm.Revolved(at, DRUM, vector(dim, 0.2, 1.0, -0.4), **options),
+        Obstacle(mpm.shapes.Torus(vector(dim, 0.15, 0.2, -0.1), 0.16), at, **options),
     ]
 
 
-NAMES = ["plane", "sphere", "box", "capsule", "revolved"]
+NAMES = ["plane", "sphere", "box", "capsule", "revolved", "torus"]
 DRUM = ((0.1, -0.2), (0.2, 0.05), (0.12, 0.2), (0.3, 0.3), (0.35, -0.3))
 """Walls of a vessel with a hole along its axis, an edge that looks inwards, and a reentrant corner."""
 
@@ -243,6 +244,7 @@ def made(shape: str, dim: int, direction: Tensor, **options: object) -> Obstacle
         "box": lambda: mpm.Box(size=vector(dim, 0.5, 0.3, 0.6), **options),
         "capsule": lambda: mpm.Capsule(half_axis=direction, radius=0.15, **options),
         "revolved": lambda: mpm.Revolved(outline=DRUM, axis=direction, **options),
+        "torus": lambda: Obstacle(mpm.shapes.Torus(direction, 0.16), **options),
     }[shape]()
 
 
@@ -428,8 +430,8 @@ def test_the_op_checks_what_memory_safety_needs(dim):
         (0, velocity[:-1]), (0, velocity[:, 0]), (0, velocity.float()), (1, table[:, :, :-1]), (1, table[0]),
         (1, table.float()), (1, table[:0]), (1, table.mT.contiguous().mT), (1, table.repeat(1, 4, 1)),
         (2, outline[:-1]), (2, outline.float()), (2, outline.reshape(-1, 2)), (2, outline.repeat(2)[::2]), (3, [0]),
-        (3, [0, 1, 2, 3, 6]), (3, [-1, 1, 2, 3, 4]), (4, [0, 0, 0, 0, 9]), (4, [0, 0, 0, 0, -1]),
-        (4, [10, 0, 0, 0, 10]), (5, [0, 1, 2, 3, 3]), (5, [4, 1, 2, 3, 3]), (6, []), (7, [0.0]), (8, [0.0]),
+        (3, [0, 1, 2, 3, 4, 7]), (3, [-1, 1, 2, 3, 4, 6]), (4, [0, 0, 0, 0, 9, 0]), (4, [0, 0, 0, 0, -1, 0]),
+        (4, [10, 0, 0, 0, 10, 0]), (5, [0, 1, 2, 3, 3, 3]), (5, [4, 1, 2, 3, 3, 3]), (6, []), (7, [0.0]), (8, [0.0]),
         (9, torch.zeros(0, dtype=torch.float64)), (9, torch.zeros(1)), (11, []), (12, []), (13, []),
     ]:  # fmt: skip
         with pytest.raises(RuntimeError):

@@ -54,6 +54,7 @@ EXACT = {
     "box": lambda dim: shapes.Box((0.3, 0.5, 0.4)[:dim]),
     "capsule": lambda dim: shapes.Capsule((0.1, 0.12, -0.07)[:dim], 0.13),
     "revolved": lambda dim: shapes.Revolved(((0.0, -0.2), (0.2, -0.1), (0.05, 0.0), (0.2, 0.2)), TURNED[:dim]),
+    "torus": lambda dim: shapes.Torus((0.1, 0.2, -0.07)[:dim], 0.1),
     "sdf": lambda dim: shapes.SDF(lambda x: x.norm(dim=1) - 0.2),
     "sampled": lambda dim: shapes.Sampled.of(shapes.Sphere(0.2), (-0.5,) * dim, (0.5,) * dim, 0.025),
 }

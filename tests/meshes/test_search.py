@@ -6,6 +6,7 @@ import torch
 
 import torch_mpm as mpm
 from torch_mpm.geometry import shapes
+from torch_mpm.geometry.shapes.mesh import _nearest_of_all, _winding_number
 from torch_mpm.meshes import nearest, winding
 
 trimesh = pytest.importorskip("trimesh")
@@ -64,7 +65,7 @@ def anywhere(count, reach=0.5, seed=3):
 @pytest.mark.parametrize("name", MESHES)
 def test_winding_number_is_that_of_angles(name):
     x, mesh = anywhere(1500), MESHES[name]()
-    angles = torch.cat([shapes._winding_number(part, corners(mesh)) for part in x.split(100)])
+    angles = torch.cat([_winding_number(part, corners(mesh)) for part in x.split(100)])
     found = winding.Columns(*indexed(mesh)).winding(x.numpy())
     np.testing.assert_allclose(found, angles, atol=1e-9)
     assert (found != 0).any()
@@ -97,7 +98,7 @@ def test_distance_and_normal_are_those_of_all_triangles(name, dtype):
             shape = shapes.Mesh(MESHES[name]())
     x = x.to(dtype).requires_grad_()
     distance, normal = shape.surface(x)
-    every = shapes._nearest_of_all(x, shape._corners(x))
+    every = _nearest_of_all(x, shape._corners(x))
     (gradient,) = torch.autograd.grad(distance.sum(), x)
     side = torch.where(shape.contains(x), -1, 1)
     atol = 1e-12 if dtype == torch.float64 else 2e-6

@@ -160,12 +160,13 @@ def test_obstacles_of_a_simulation_are_drawn_where_they_act(dim):
         mpm.boundaries.Capsule(centre, axis, 0.1, **motion),
         mpm.boundaries.Plane(centre, (0.3, 1.0, 0.2)[:dim], **motion),
         mpm.boundaries.Revolved(centre, ((0.1, 0.0), (0.3, 0.0), (0.2, 0.4)), axis, **motion),
+        mpm.Obstacle(mpm.shapes.Torus(axis, 0.1), centre, **motion),
         mpm.boundaries.SDF(lambda p: p.abs().sum(1) - 0.3, centre, **motion),
     ]
     time = 0.7
     for body in bodies:
         drawn = render.obstacle_shapes(body, time, bounds)
-        assert len(drawn) == (2 if body.shape.name == "revolved" and dim == 2 else 1)
+        assert len(drawn) == (2 if body.shape.name in ("revolved", "torus") and dim == 2 else 1)
         pose = body.pose(time)
         local = (torch.as_tensor(np.concatenate([s.world() for s in drawn])) - pose.centre) @ pose.rotation
         distance, _ = body.shape.surface(local)

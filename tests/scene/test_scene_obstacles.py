@@ -23,6 +23,8 @@ def box(x, **more):
     return {"shape": "box", "center": (x, 0.2), "size": (0.3, 0.1), **more}
 
 
+WEDGE = {"shape": "revolved", "outline": ((0.0, 0.0), (0.3, 0.0), (0.0, 0.2)), "center": (0.5, 0.1)}
+RING = {"shape": "torus", "center": (0.5, 0.1), "radius": 0.05}
 SCENES = [
     [box(0.5), box(0.2, rotation=0.4, friction=0.3), {"shape": "sphere", "center": (0.9, 0.3), "radius": 0.1}],
     [box(0.4, velocity=(0.3, 0.0), spin=1.0)],
@@ -30,6 +32,10 @@ SCENES = [
     [],
     [{"shape": "capsule", "a": (0.3, 0.2), "b": (0.7, 0.25), "radius": 0.05, "contact": "sticky"}],
     [{"shape": "plane", "center": (0.5, 0.1), "normal": (0.0, 2.0)}, box(0.3, velocity=(0.1, 0.1), spin=-2.0)],
+    [WEDGE],
+    [{**WEDGE, "axis": (1.0, 2.0)}],
+    [{**RING, "axis": (1.0, 0.2), "ring_radius": 0.1}],
+    [{**RING, "axis": (2.0, -3.0), "ring_radius": 0.2}],
 ]
 
 
@@ -41,7 +47,7 @@ def rolled(built, dtype):
 def test_a_scene_of_a_batch_moves_as_alone(device):
     precise = {**BASE, "precision": "float64"}
     batch = Scene(**precise, scene=[{"body": [BODY], "obstacle": o} for o in SCENES]).build(device)
-    assert len(batch.step.boundaries) == 7  # of 10: boxes at rest, boxes that move and planes have met
+    assert len(batch.step.boundaries) == 10  # of 14: boxes at rest, boxes that move, planes and rings have met
     assert batch.step.explain(batch.state).startswith("all steps")
     end = rolled(batch, torch.float64)
     for k, obstacles in enumerate(SCENES):

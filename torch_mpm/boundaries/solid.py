@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..geometry.shapes import Box, Capsule, Plane, Sampled, Shape, Sphere
+from ..geometry.shapes import Sampled, Shape
 from ..geometry.vectors import norm, unit
 from . import constraints
 from .constraints import KINDS, Constraints
@@ -309,11 +309,6 @@ def _is_closed(face: Face) -> bool:
     return face.kind != "open" and math.isfinite(face.plane)
 
 
-def _is_plain(obstacle: Obstacle) -> bool:
-    """Whether the shape is convex and its surface is one face."""
-    return type(obstacle.shape) in (Plane, Sphere, Capsule)
-
-
 def _has_faces(obstacle: Obstacle) -> bool:
     """Whether the shape knows its faces."""
     return type(obstacle.shape).surface_faces is not Shape.surface_faces
@@ -321,7 +316,7 @@ def _has_faces(obstacle: Obstacle) -> bool:
 
 def _may_join(obstacles: Sequence[Obstacle]) -> bool:
     """Whether surfaces of obstacles may join at inner edges."""
-    return len(obstacles) > 1 or not _is_plain(obstacles[0])
+    return len(obstacles) > 1 or not obstacles[0].shape.is_smooth
 
 
 # ---- faces near nodes
@@ -547,7 +542,7 @@ def _needs_search(solid: SolidNodes, x: Tensor, distance: Tensor, around: Tensor
     for k, obstacle in enumerate(solid.obstacles):
         own = (around == k) & ~near
         rows = own.nonzero()[:, 0]
-        if len(rows) == 0 or _is_plain(obstacle):
+        if len(rows) == 0 or obstacle.shape.is_smooth:
             continue
         joins = torch.ones_like(rows, dtype=torch.bool)
         if not _has_faces(obstacle):
@@ -600,7 +595,7 @@ def _without_others(solid: SolidNodes, x: Tensor, distance: Tensor, around: Tens
     """Distances [n, K], infinite but for a convex obstacle around a node where no other one, nor a wall, is as near as
     its surface: its faces are not combined with those of others."""
     near = _has_others(solid, x, distance, around)[:, None]
-    convex = solid.constants([_is_plain(o) or type(o.shape) is Box for o in solid.obstacles])
+    convex = solid.constants([o.shape.is_convex for o in solid.obstacles])
     others = torch.arange(distance.shape[1], device=x.device) != around[:, None]
     return torch.where(others & ~near & convex[around][:, None], torch.inf, distance)
 

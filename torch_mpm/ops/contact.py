@@ -1,9 +1,9 @@
 """Contact of the grid with rigid obstacles, all of them in one op: Python face, fake kernels and autograd.
 
-The kernel knows the shapes of `KERNEL_SHAPES`. The obstacles of a call are rows of a table [1 or B, K, width], one for
-all scenes or one per scene, of the nodes' dtype:
+The kernel knows the shapes that have a `number`. The obstacles of a call are rows of a table [1 or B, K, width], one
+for all scenes or one per scene, of the nodes' dtype:
 
-    friction, position [D], velocity [D], rotation [A], angular_velocity [A], direction or size [D], radius
+    friction, position [D], velocity [D], rotation [A], angular_velocity [A], vector [D], radius
 
 with A = 1 angle in 2-D and a vector of A = 3 in 3-D. What an obstacle does not have is zero. Shapes of many numbers
 have them one after another in a second tensor: the corners of a revolved shape (distance from the axis, position along
@@ -29,9 +29,15 @@ from ..step.clocks import StepTimes
 from .arguments import check_list, differentiate, refuse_vmap, sizes
 from .autograd import dispatch, register_autograd, save_with_topology, saved_with_topology
 from .grid_update import CONTACT_KINDS, CONTACT_NAMES, sum_by_scene_of_blocks, wall_arguments
-from .obstacle_tables import KERNEL_SHAPES, size_of_data, tables, tables_over
+from .obstacle_tables import tables, tables_over
 
 MAX_OBSTACLES = 64  # of one call, csrc/grid/obstacle.h
+KERNEL_SHAPES = {
+    shape.number: shape
+    for shape in vars(shapes).values()
+    if isinstance(shape, type) and issubclass(shape, shapes.Shape) and shape.number is not None
+}
+"""Shapes of the kernel by their numbers."""
 
 
 def is_solid(boundary: Any) -> bool:
@@ -49,7 +55,7 @@ def fusible(obstacle: Any, time: float | Tensor, paths: bool = False) -> bool:
     A position as a function of time, and a time that requires grad, need `Obstacle.apply`; so does any subclass with a
     `forward` or an `apply` of its own. With `paths`, whether `substeps` does, where such a position may be, too.
     """
-    if not is_solid(obstacle) or type(obstacle.shape) not in KERNEL_SHAPES or (obstacle.follows_path and not paths):
+    if not is_solid(obstacle) or obstacle.shape.number is None or (obstacle.follows_path and not paths):
         return False
     return not (isinstance(time, Tensor) and time.requires_grad)
 
@@ -111,8 +117,8 @@ def check_contact(blocks: Blocks, velocity: Tensor, obstacles: Sequence[Obstacle
     if velocity.dtype not in FLOATING:
         raise TypeError(f"velocity must be float32 or float64, got {velocity.dtype}")
     for k, obstacle in enumerate(check_list("obstacles", obstacles)):
-        if not isinstance(obstacle, Obstacle) or type(obstacle.shape) not in KERNEL_SHAPES:
-            expected = ", ".join(shape.name for shape in KERNEL_SHAPES)
+        if not isinstance(obstacle, Obstacle) or obstacle.shape.number is None:
+            expected = ", ".join(KERNEL_SHAPES[number].name for number in sorted(KERNEL_SHAPES))
             raise TypeError(f"obstacles[{k}] must be an obstacle of one of {expected}, got {type(obstacle).__name__}")
 
 
@@ -133,8 +139,8 @@ def obstacle_arguments(
         table = tables(group, like, scenes) if times is None else tables_over(group, like, scenes, times)
     return (
         *table,
-        [KERNEL_SHAPES[type(o.shape)].number for o in group],
-        [size_of_data(o.shape) for o in group],
+        [o.shape.number for o in group],
+        [o.shape.data_count() for o in group],
         [CONTACT_KINDS[o.kind] for o in group],
         [-1 if o.scene is None else o.scene for o in group],
         [o.start for o in group],
@@ -255,7 +261,8 @@ def composed_contact(
     obstacles, acts, first = [], [], 0
     for k, (shape, size, kind, scene, start, end) in enumerate(zip(*kinds, strict=True)):
         parameters = _parameters(rows[:, k], velocity.shape[1])
-        form = _shape(shape, parameters.pop("extent"), parameters.pop("radius"), data[first : first + size])
+        row = parameters.pop("vector"), parameters.pop("radius"), data[first : first + size]
+        form = KERNEL_SHAPES[shape].from_row(*row)
         obstacles.append(Obstacle(form, kind=CONTACT_NAMES[kind], start=start, end=end, **parameters))
         acts.append(active if scene < 0 else active & (node_scene == scene))
         first += size
@@ -266,24 +273,10 @@ def composed_contact(
 def _parameters(row: Tensor, dim: int) -> dict[str, Any]:
     """The columns of a table [slots, width] by their names."""
     turn = 1 if dim == 2 else 3
-    names = ("friction", "position", "velocity", "rotation", "angular_velocity", "extent", "radius")
+    names = ("friction", "position", "velocity", "rotation", "angular_velocity", "vector", "radius")
     values = dict(zip(names, row.split([1, dim, dim, turn, turn, dim, 1], 1), strict=True))
     scalars = ("friction", "radius", *(("rotation", "angular_velocity") if dim == 2 else ()))
     return {name: value[:, 0] if name in scalars else value for name, value in values.items()}
-
-
-def _shape(number: int, extent: Tensor, radius: Tensor, data: Tensor) -> shapes.Shape:
-    if number == 0:
-        return shapes.Plane(extent)
-    if number == 1:
-        return shapes.Sphere(radius.detach())
-    if number == 2:
-        return shapes.Box(extent.detach())
-    if number == 3:
-        return shapes.Capsule(extent, radius.detach())
-    if number == 5:
-        return shapes.Sampled.from_data(data, extent.shape[-1])
-    return shapes.Revolved(data.reshape(-1, 2), extent)
 
 
 register_autograd("contact", _backward, _setup)

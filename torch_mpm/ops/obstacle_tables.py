@@ -4,51 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
 from ..boundaries.obstacles import Obstacle
-from ..geometry import shapes
 from ..geometry.per_scene import SceneParameters
 from ..step.clocks import StepTimes
-
-
-class KernelShape(NamedTuple):
-    """Kernel number of a shape, the name of its parameter in the column of directions and sizes, and those of its other
-    parameters.
-    """
-
-    number: int
-    extent: str | None
-    others: tuple[str, ...] = ()
-
-
-KERNEL_SHAPES: dict[type[shapes.Shape], KernelShape] = {
-    shapes.Plane: KernelShape(0, "normal"),
-    shapes.Sphere: KernelShape(1, None, ("radius",)),
-    shapes.Box: KernelShape(2, "size"),
-    shapes.Capsule: KernelShape(3, "half_axis", ("radius",)),
-    shapes.Revolved: KernelShape(4, "axis", ("outline",)),
-    shapes.Cylinder: KernelShape(4, "axis", ("outline",)),
-    shapes.Sampled: KernelShape(5, None, ("values", "lower", "spacing")),
-}
-
-
-def size_of_data(shape: shapes.Shape) -> int:
-    """Number of data of a shape beside its row of the table, without computing them."""
-    if isinstance(shape, shapes.Revolved):
-        return 2 * len(shape.outline)
-    return 2 * shape.values.dim() + 1 + shape.values.numel() if isinstance(shape, shapes.Sampled) else 0
-
-
-def _data(shape: shapes.Shape, like: Tensor) -> Tensor:
-    """Data of a shape beside its row of the table [n]."""
-    if isinstance(shape, shapes.Revolved):
-        return shape.parameter("outline", like, (len(shape.outline), 2)).reshape(-1)
-    return shape.data(like) if isinstance(shape, shapes.Sampled) else like.new_zeros(0)
 
 
 def tables(obstacles: Sequence[Obstacle], like: Tensor, scenes: int) -> tuple[Tensor, Tensor]:
@@ -69,16 +33,14 @@ def tables_over(obstacles: Sequence[Obstacle], like: Tensor, scenes: int, times:
     rows = [_row_over(o, like, times) for o in obstacles]
     count = _count([row.shape[1] for row in rows], scenes)
     table = torch.stack([row.expand(-1, count, -1) for row in rows], 2).contiguous()
-    return table, torch.cat([_data(o.shape, like) for o in obstacles])
+    return table, torch.cat([o.shape.data(like) for o in obstacles])
 
 
 def _values(obstacle: Obstacle) -> tuple[Any, ...]:
     """Numbers and tensors of an obstacle that enter the tables."""
     moved, shape = obstacle.motion, obstacle.shape
     motion = (obstacle.friction, moved.position, moved.velocity, moved.rotation, moved.angular_velocity)
-    kind = KERNEL_SHAPES[type(shape)]
-    extent = None if kind.extent is None else getattr(shape, kind.extent, None)
-    return (*motion, extent, *(getattr(shape, name) for name in kind.others))
+    return (*motion, *(getattr(shape, name) for name in shape.arguments))
 
 
 def _build(obstacles: Sequence[Obstacle], like: Tensor, scenes: int) -> tuple[Tensor, Tensor]:
@@ -86,7 +48,7 @@ def _build(obstacles: Sequence[Obstacle], like: Tensor, scenes: int) -> tuple[Te
     rows = [_joined(_parts(o, like)) for o in obstacles]
     count = _count([row.shape[0] for row in rows], scenes)
     table = torch.stack([row.expand(count, -1) for row in rows], 1).contiguous()
-    return table, torch.cat([_data(o.shape, like) for o in obstacles])
+    return table, torch.cat([o.shape.data(like) for o in obstacles])
 
 
 def _check_scenes(obstacles: Sequence[Obstacle], like: Tensor, scenes: int) -> None:
@@ -107,21 +69,18 @@ def _parts(obstacle: Obstacle, like: Tensor) -> dict[str, Tensor]:
     vector, shape = (like.shape[1],), obstacle.shape
     turn = () if like.shape[1] == 2 else (3,)
     motion = {"position": vector, "velocity": vector, "rotation": turn, "angular_velocity": turn}
-    absent = "position" if obstacle.follows_path else None
+    absent = {"position"} if obstacle.follows_path else set()
+    absent |= {name for name in motion if getattr(obstacle.motion, name) is None}
     parts = {"friction": _part(obstacle, "friction", like, ())}
     for name, size in motion.items():
-        parts[name] = _part(obstacle.motion, None if name == absent else name, like, size)
-    extent = KERNEL_SHAPES[type(shape)].extent
-    if extent == "axis" and getattr(shape, "axis", None) is None:
-        parts["extent"] = torch.eye(like.shape[1], dtype=like.dtype, device=like.device)[1:2]
-    else:
-        parts["extent"] = _part(shape, extent, like, vector)
-    return parts | {"radius": _part(shape, "radius", like, ())}
+        parts[name] = _part(obstacle.motion, None if name in absent else name, like, size)
+    parts["vector"] = _part(shape, shape.vector, like, vector)
+    return parts | {"radius": _part(shape, "radius" if "radius" in shape.RANKS else None, like, ())}
 
 
 def _part(owner: SceneParameters, name: str | None, like: Tensor, shape: tuple[int, ...]) -> Tensor:
-    """A parameter [1 or B, n]."""
-    if name is None or getattr(owner, name, None) is None:
+    """A parameter [1 or B, n]; zero where there is none."""
+    if name is None:
         return like.new_zeros(1, math.prod(shape))
     value = owner.parameter(name, like, shape)
     return value.reshape(1 if value.dim() == len(shape) else value.shape[0], -1)

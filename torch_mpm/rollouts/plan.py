@@ -32,7 +32,7 @@ from ..laws.custom import CustomLaw
 from ..laws.parameters import has_hooks
 from ..ops.arguments import check_choice, split_dt
 from ..ops.contact import MAX_OBSTACLES, fusible
-from ..ops.obstacle_tables import KERNEL_SHAPES, numbers_of_a_step, path_requires_grad
+from ..ops.obstacle_tables import numbers_of_a_step, path_requires_grad
 from ..state.state import State, check_state, tensors_of
 from ..step.clocks import StepTimes, requires_grad
 from ..step.status import ActivationRecord
@@ -463,7 +463,7 @@ def _is_uniform(law: Any) -> bool:
 def _path_bytes(step: Step, state: State, dt: float | Tensor) -> int:
     """Size of the table of obstacles on paths, per step [bytes]; zero without such obstacles, and with shapes that have
     no entry in a table."""
-    if not follows_paths(step) or any(type(o.shape) not in KERNEL_SHAPES for o in _obstacles(step)):
+    if not follows_paths(step) or any(o.shape.number is None for o in _obstacles(step)):
         return 0
     clocks_of_scenes = isinstance(dt, Tensor) or isinstance(state.time, Tensor)
     numbers = numbers_of_a_step(_obstacles(step), state.x, step.grid.scenes if clocks_of_scenes else 1)

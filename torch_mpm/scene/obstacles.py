@@ -17,6 +17,7 @@ from ..boundaries import Obstacle
 from ..geometry import shapes
 from ..geometry.shapes import Shape
 from .places import obstacle
+from .schema import OBSTACLE_WORDS
 
 FAR = 1000.0
 """Distance of an obstacle from the scenes that lack it, in diagonals of the domain."""
@@ -61,8 +62,12 @@ def obstacles(entries: Sequence[Any], grid: Any, dtype: torch.dtype, device: tor
 
 def _form(words: Any) -> str:
     """Properties that merged obstacles must share."""
-    kept = (words.shape, words.contact, words.start, words.end, words.held, words.temperature is None)
-    return repr((*kept, getattr(words, "outline", None), words.velocity is None, words.spin is None))
+    kept = (words.shape, words.contact, words.start, words.end, words.held)
+    keys = OBSTACLE_WORDS[words.shape].keys.items()
+    outlines = [getattr(words, name) for name, key in keys if key.kind == "outline"]
+    optional = [name for name, key in keys if key.optional]
+    absent = [getattr(words, name) is None for name in ("temperature", "velocity", "spin", *optional)]
+    return repr((kept, outlines, absent))
 
 
 def _joined(words: Sequence[Any], grid: Any, dtype: torch.dtype, device: torch.device) -> Obstacle:
@@ -93,22 +98,12 @@ def _joined(words: Sequence[Any], grid: Any, dtype: torch.dtype, device: torch.d
     )
 
 
-PARAMETERS = {
-    shapes.Plane: ("normal",),
-    shapes.Sphere: ("radius",),
-    shapes.Box: ("size",),
-    shapes.Capsule: ("half_axis", "radius"),
-    shapes.Revolved: ("outline", "axis"),
-}
-"""Arguments of the shapes of obstacles."""
-
-
 def _shape(each: Sequence[Any], values: Any) -> Shape:
     one = next(shape for shape in each if shape is not None)
     found: dict[str, Any] = {}
-    for name in PARAMETERS[type(one)]:
+    for name in one.arguments:
         own = getattr(one, name)
-        if name == "outline" or own is None:
+        if name not in one.RANKS or own is None:
             found[name] = own
         else:
             found[name] = values([None if shape is None else getattr(shape, name) for shape in each], own)

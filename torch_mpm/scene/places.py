@@ -12,8 +12,7 @@ from pydantic import BaseModel
 
 from .. import boundaries
 from ..boundaries import Obstacle
-from ..geometry import seed, shapes
-from ..geometry.shapes import Shape
+from ..geometry import seed
 from . import schema
 
 PLACES = ("lower", "upper", "center", "a", "b", "offset", "view")
@@ -65,7 +64,7 @@ def region(body: schema.Body, folder: Path | None) -> seed.Region | None:
 
 def obstacle(words: Any, scene: int | None) -> Obstacle:
     """Boundary of the step for an obstacle of a scene."""
-    shape, position = _shape(words)
+    shape, position = schema.OBSTACLE_SHAPES[words.shape].from_words(words)
     return boundaries.Obstacle(
         shape,
         position,
@@ -78,17 +77,3 @@ def obstacle(words: Any, scene: int | None) -> Obstacle:
         end=math.inf if words.end is None else words.end,
         scene=scene,
     )
-
-
-def _shape(words: Any) -> tuple[Shape, Any]:
-    """Shape of an obstacle, and the position of its origin."""
-    if isinstance(words, schema.PlaneObstacle):
-        return shapes.Plane(words.normal), words.center
-    if isinstance(words, schema.BoxObstacle):
-        return shapes.Box(words.size), words.center
-    if isinstance(words, schema.SphereObstacle):
-        return shapes.Sphere(words.radius), words.center
-    if isinstance(words, schema.RevolvedObstacle):
-        return shapes.Revolved(words.outline, words.axis), words.center
-    half = [0.5 * (q - p) for p, q in zip(words.a, words.b, strict=True)]
-    return shapes.Capsule(half, words.radius), [0.5 * (p + q) for p, q in zip(words.a, words.b, strict=True)]

@@ -13,6 +13,8 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, create_model, model_validator
 
 from .. import laws
+from ..geometry import shapes
+from ..geometry.shapes import SceneWords, Shape
 from ..ops.registry import LAWS, Quantity
 
 Positive = Annotated[float, Field(gt=0)]
@@ -398,67 +400,37 @@ class Obstacle(Model):
     """opacity in pictures; 1 is opaque"""
 
 
-class PlaneObstacle(Obstacle):
-    """Half-space behind a plane."""
-
-    shape: Literal["plane"] = "plane"
-    """kind of shape"""
-    center: Vector
-    """a point of the plane [m]"""
-    normal: Vector
-    """direction out of the half-space"""
+KEY_TYPES: dict[str, Any] = {
+    "point": Vector,
+    "vector": Vector,
+    "length": Positive,
+    "outline": Annotated[list[tuple[NotNegative, float]], Field(min_length=3)],
+}
+"""Types of the kinds of keys of shapes."""
 
 
-class BoxObstacle(Obstacle):
-    """Box, turned by its rotation."""
-
-    shape: Literal["box"] = "box"
-    """kind of shape"""
-    center: Vector
-    """centre [m]"""
-    size: Vector
-    """edge lengths [m]"""
-
-
-class SphereObstacle(Obstacle):
-    """Ball; a disc in 2-D."""
-
-    shape: Literal["sphere"] = "sphere"
-    """kind of shape"""
-    center: Vector
-    """centre [m]"""
-    radius: Positive
-    """radius [m]"""
+def _obstacle(shape: type[Shape], words: SceneWords) -> type[Obstacle]:
+    """The table of an obstacle, from the words of its shape."""
+    fields: dict[str, Any] = {"shape": (Literal[shape.name], Field(shape.name, description="kind of shape"))}
+    for name, key in words.keys.items():
+        kind = KEY_TYPES[key.kind]
+        given: dict[str, Any] = {"default": None} if key.optional else {}
+        fields[name] = (kind | None if key.optional else kind, Field(**given, description=key.description))
+    return create_model(f"{shape.name.capitalize()}Obstacle", __base__=Obstacle, __doc__=words.summary, **fields)
 
 
-class CapsuleObstacle(Obstacle):
-    """All points near a segment."""
+OBSTACLE_SHAPES: dict[str, type[Shape]] = {
+    shape.name: shape
+    for shape in vars(shapes).values()
+    if isinstance(shape, type) and issubclass(shape, Shape) and shape.words is not None
+}
+"""Shapes of obstacles by their names; they include every new class in torch_mpm.shapes with words."""
 
-    shape: Literal["capsule"] = "capsule"
-    """kind of shape"""
-    a: Vector
-    """one end of the segment [m]"""
-    b: Vector
-    """other end of the segment [m]"""
-    radius: Positive
-    """distance from the segment [m]"""
+OBSTACLE_WORDS = {name: shape.words for name, shape in OBSTACLE_SHAPES.items() if shape.words is not None}
 
-
-class RevolvedObstacle(Obstacle):
-    """Polygon revolved about an axis: cone, tube, funnel, hourglass, drum; in 2-D the polygon and its mirror image."""
-
-    shape: Literal["revolved"] = "revolved"
-    """kind of shape"""
-    outline: Annotated[list[tuple[NotNegative, float]], Field(min_length=3)]
-    """corners of the polygon: distance from the axis and position along it [m]"""
-    center: Vector
-    """origin of the positions along the axis [m]"""
-    axis: Vector | None = None
-    """direction of the axis; by default y"""
-
-
-AnyObstacle = Annotated[
-    PlaneObstacle | BoxObstacle | SphereObstacle | CapsuleObstacle | RevolvedObstacle, Field(discriminator="shape")
+AnyObstacle: Any = Annotated[
+    functools.reduce(operator.or_, [_obstacle(OBSTACLE_SHAPES[name], words) for name, words in OBSTACLE_WORDS.items()]),
+    Field(discriminator="shape"),
 ]
 
 

@@ -1,0 +1,352 @@
+#pragma once
+
+#include "grid/obstacle.h"
+
+// The shapes of obstacles: their distance and their faces. A new shape is a struct here, a number and a case of
+// `visit_shape`; its class in Python has the same number.
+namespace mpm {
+
+enum class ObstacleShape : int { plane, sphere, box, capsule, revolved, sampled, torus, count };
+
+inline namespace TORCH_MPM_ISA {
+
+// Signed distance of a point (distance from the axis, position along it) from a closed polygon, and the outward normal
+// of its nearest edge; among equals, the first counts. `second` is the distance of the edge that is nearest but for
+// this one.
+template <class S>
+MPM_HD S polygon_surface(const ValueOf<S>* corner, int corners, const Vector<S, 2>& p, Vector<S, 2>& normal,
+                         ValueOf<S>& second) {
+  using T = ValueOf<S>;
+  S nearest = S(std::numeric_limits<T>::max());
+  second = std::numeric_limits<T>::max();
+  normal = zero_vector<S, 2>();
+  bool inside = false;
+  for (int k = 0; k < corners; k++) {
+    const T *const a = corner + 2 * k, *const b = corner + 2 * (k + 1 < corners ? k + 1 : 0);
+    const Vector<S, 2> edge = {{lift<S>(b[0] - a[0]), lift<S>(b[1] - a[1])}};
+    const Vector<S, 2> arm = {{p[0] - lift<S>(a[0]), p[1] - lift<S>(a[1])}};
+    // An odd number of edges is crossed by the ray from the point away from the axis.
+    const S side = edge[0] * arm[1] - edge[1] * arm[0];
+    if ((a[1] > value_of(p[1])) != (b[1] > value_of(p[1])) && (edge[1] > S(0) ? side > S(0) : side < S(0)))
+      inside = !inside;
+    if (a[0] == T(0) && b[0] == T(0)) continue;  // an edge on the axis is inside the body
+    const S along = dot(arm, edge) / dot(edge, edge);
+    Vector<S, 2> offset;
+    if (!(along < S(1)))  // exactly as from the next edge
+      offset = {{p[0] - lift<S>(b[0]), p[1] - lift<S>(b[1])}};
+    else
+      offset = arm + (along > S(0) ? S(0) - along : S(0)) * edge;
+    const S distance = length(offset);
+    if (distance < nearest) {
+      second = value_of(nearest);
+      nearest = distance;
+      normal = direction(Vector<S, 2>{{edge[1], S(0) - edge[0]}});
+    } else if (value_of(distance) < second) {
+      second = value_of(distance);
+    }
+  }
+  return inside ? S(0) - nearest : nearest;
+}
+
+// Height of a point (distance from the axis, position along it) above the line of edge k of a polygon; `beyond` is how
+// far the foot of the point is beyond the ends of the edge. Far above where the edge is on the axis, inside the body.
+template <class S>
+MPM_HD S edge_height(const ValueOf<S>* corner, int corners, int k, const Vector<S, 2>& p, Vector<S, 2>& normal,
+                     ValueOf<S>& beyond) {
+  using T = ValueOf<S>;
+  const T *const a = corner + 2 * k, *const b = corner + 2 * (k + 1 < corners ? k + 1 : 0);
+  const Vector<S, 2> edge = {{lift<S>(b[0] - a[0]), lift<S>(b[1] - a[1])}};
+  const Vector<S, 2> arm = {{p[0] - lift<S>(a[0]), p[1] - lift<S>(a[1])}};
+  normal = direction(Vector<S, 2>{{edge[1], S(0) - edge[0]}});
+  const T size = value_of(length(edge)), along = size > T(0) ? value_of(dot(arm, edge)) / size : T(0);
+  beyond = along < T(0) ? T(0) - along : along > size ? along - size : T(0);
+  if (size == T(0) || (a[0] == T(0) && b[0] == T(0))) return S(std::numeric_limits<T>::max());
+  return dot(arm, normal);
+}
+
+// Signed distance by multilinear interpolation of samples, and the direction of its gradient; beyond the samples the
+// distance there and the way to there are legs of a right triangle, so that it is a lower bound. Far away where the
+// numbers are not those of samples.
+template <class S, int D>
+MPM_HD S sampled_surface(const ValueOf<S>* data, int numbers, const Vector<S, D>& p, Vector<S, D>& normal) {
+  using T = ValueOf<S>;
+  normal = zero_vector<S, D>();
+  int64_t samples = numbers > 2 * D ? 1 : 0;
+  int count[D];
+  MPM_UNROLL for (int i = 0; i < D && samples; i++) {
+    const T n = data[D + 1 + i];
+    count[i] = n >= T(2) && n < T(1 << 20) ? int(n) : 0;
+    samples *= count[i];
+  }
+  if (samples == 0 || samples > numbers - (2 * D + 1)) return S(std::numeric_limits<T>::max());
+  const T spacing = data[D];
+  int cell[D];
+  Vector<S, D> weight, beyond;  // of the upper node
+  MPM_UNROLL for (int i = 0; i < D; i++) {
+    const S along = (p[i] - lift<S>(data[i])) / lift<S>(spacing);
+    const S last = lift<S>(T(count[i] - 1));
+    const S inside = along > S(0) ? (along < last ? along : last) : S(0);
+    cell[i] = int(value_of(inside));
+    if (cell[i] > count[i] - 2) cell[i] = count[i] - 2;
+    weight[i] = inside - lift<S>(T(cell[i]));
+    beyond[i] = (along - inside) * lift<S>(spacing);
+  }
+  S distance = S(0);
+  MPM_UNROLL for (int corner = 0; corner < 1 << D; corner++) {
+    int64_t index = 0;
+    S product = S(1);
+    MPM_UNROLL for (int i = 0; i < D; i++) {
+      const int upper = corner >> i & 1;
+      index = index * count[i] + cell[i] + upper;
+      product = product * (upper ? weight[i] : S(1) - weight[i]);
+    }
+    const S value = lift<S>(data[2 * D + 1 + index]);
+    distance = distance + product * value;
+    MPM_UNROLL for (int i = 0; i < D; i++) {
+      S slope = value;
+      MPM_UNROLL for (int j = 0; j < D; j++) {
+        const int upper = corner >> j & 1;
+        slope = slope * (j == i ? S(upper ? 1 : -1) : upper ? weight[j] : S(1) - weight[j]);
+      }
+      normal[i] = normal[i] + slope;
+    }
+  }
+  normal = direction(normal);
+  const S far = dot(beyond, beyond);
+  return far > S(0) ? sqrt(distance * distance + far) : distance;
+}
+
+template <class S, int D>
+MPM_HD Vector<S, D> extent_of(const ObstaclePose<S, D>& o) {
+  Vector<S, D> extent;
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    extent[i] = o.row->extent[i];
+  return extent;
+}
+
+// A point by its distance from an axis through the origin, and its position along that.
+template <class S, int D>
+struct AroundAxis {
+  Vector<S, D> axis, across;  // unit vectors; of a point on the axis, `across` is zero
+  Vector<S, 2> point;
+
+  MPM_HD AroundAxis(const Vector<S, D>& direction_of_axis, const Vector<S, D>& body)
+      : axis(direction(direction_of_axis)) {
+    const S along = dot(body, axis);
+    across = body + (S(0) - along) * axis;
+    point = {{length(across), along}};
+    across = direction(across);
+  }
+  MPM_HD Vector<S, D> in_space(const Vector<S, 2>& v) const { return v[0] * across + v[1] * axis; }
+};
+
+// What most shapes have: one curved face, the surface.
+template <class Shape>
+struct OneFace {
+  // Whether the height above a face is linear in the position.
+  template <int D>
+  static constexpr bool flat = false;
+
+  template <int D>
+  MPM_HD static int face_count(int) {
+    return 1;
+  }
+  template <class S, int D>
+  MPM_HD static S face_height(const ObstaclePose<S, D>& o, int, const Vector<S, D>& body, Vector<S, D>& normal,
+                              ValueOf<S>&) {
+    ValueOf<S> second;
+    return Shape::surface(o, body, normal, second);
+  }
+};
+
+struct PlaneShape : OneFace<PlaneShape> {
+  template <int D>
+  static constexpr bool flat = true;
+
+  template <class S, int D>
+  MPM_HD static S surface(const ObstaclePose<S, D>& o, const Vector<S, D>& body, Vector<S, D>& normal, ValueOf<S>&) {
+    const Vector<S, D> extent = extent_of(o);
+    normal = (S(1) / length(extent)) * extent;
+    return dot(body, normal);
+  }
+};
+
+// All points within a radius of the one whose offset from `body` is given.
+template <class S, int D>
+MPM_HD S ball_surface(const Vector<S, D>& offset, const S& radius, Vector<S, D>& normal) {
+  const S distance = length(offset);
+  normal = (distance > S(0) ? S(1) / distance : S(0)) * offset;
+  return distance - radius;
+}
+
+struct SphereShape : OneFace<SphereShape> {
+  template <class S, int D>
+  MPM_HD static S surface(const ObstaclePose<S, D>& o, const Vector<S, D>& body, Vector<S, D>& normal, ValueOf<S>&) {
+    return ball_surface(body, o.row->radius, normal);
+  }
+};
+
+struct CapsuleShape : OneFace<CapsuleShape> {
+  template <class S, int D>
+  MPM_HD static S surface(const ObstaclePose<S, D>& o, const Vector<S, D>& body, Vector<S, D>& normal, ValueOf<S>&) {
+    const Vector<S, D> half = extent_of(o);
+    const S squared = dot(half, half);
+    S along = squared > S(0) ? dot(body, half) / squared : S(0);
+    along = along < S(-1) ? S(-1) : along > S(1) ? S(1) : along;
+    return ball_surface(body + (S(0) - along) * half, o.row->radius, normal);
+  }
+};
+
+// All points within a radius of a circle, whose axis is as long as its radius; in 2-D two discs.
+struct TorusShape : OneFace<TorusShape> {
+  template <class S, int D>
+  MPM_HD static S surface(const ObstaclePose<S, D>& o, const Vector<S, D>& body, Vector<S, D>& normal, ValueOf<S>&) {
+    const Vector<S, D> ring = extent_of(o);
+    const AroundAxis<S, D> around(ring, body);
+    Vector<S, 2> plane_normal;
+    const S distance =
+        ball_surface(Vector<S, 2>{{around.point[0] - length(ring), around.point[1]}}, o.row->radius, plane_normal);
+    normal = around.in_space(plane_normal);
+    return distance;
+  }
+};
+
+// Faces 2 i and 2 i + 1 are the lower and the upper one of axis i.
+struct BoxShape {
+  template <int D>
+  static constexpr bool flat = true;
+
+  // The nearest face is that of the axis with the least negative distance.
+  template <class S, int D>
+  MPM_HD static S surface(const ObstaclePose<S, D>& o, const Vector<S, D>& body, Vector<S, D>& normal, ValueOf<S>&) {
+    S deepest = S(0);
+    int axis = -1;
+    MPM_UNROLL for (int i = 0; i < D; i++) {
+      const S distance = abs(body[i]) - S(0.5) * o.row->extent[i];
+      if (axis < 0 || distance > deepest) deepest = distance, axis = i;
+    }
+    MPM_UNROLL for (int i = 0; i < D; i++)
+      normal[i] = i != axis ? S(0) : body[i] < S(0) ? S(-1) : S(1);
+    return deepest;
+  }
+  template <int D>
+  MPM_HD static int face_count(int) {
+    return 2 * D;
+  }
+  template <class S, int D>
+  MPM_HD static S face_height(const ObstaclePose<S, D>& o, int face, const Vector<S, D>& body, Vector<S, D>& normal,
+                              ValueOf<S>&) {
+    const int axis = face / 2;
+    const S side = S(face % 2 ? 1 : -1);
+    MPM_UNROLL for (int i = 0; i < D; i++)
+      normal[i] = i == axis ? side : S(0);
+    S along = S(0), size = S(0);
+    MPM_UNROLL for (int i = 0; i < D; i++)
+      if (i == axis) along = side * body[i], size = o.row->extent[i];
+    return along - S(0.5) * size;
+  }
+};
+
+// One face for each edge of its polygon. Their numbers are the corners, anticlockwise: distance from the axis and
+// position along it.
+struct RevolvedShape {
+  template <int D>
+  static constexpr bool flat = D == 2;
+
+  template <class S, int D>
+  MPM_HD static S surface(const ObstaclePose<S, D>& o, const Vector<S, D>& body, Vector<S, D>& normal,
+                          ValueOf<S>& second) {
+    const AroundAxis<S, D> around(extent_of(o), body);
+    Vector<S, 2> plane_normal;
+    const S distance = polygon_surface(o.data, o.numbers / 2, around.point, plane_normal, second);
+    normal = around.in_space(plane_normal);
+    return distance;
+  }
+  template <int D>
+  MPM_HD static int face_count(int numbers) {
+    return numbers / 2;
+  }
+  template <class S, int D>
+  MPM_HD static S face_height(const ObstaclePose<S, D>& o, int face, const Vector<S, D>& body, Vector<S, D>& normal,
+                              ValueOf<S>& beyond) {
+    const AroundAxis<S, D> around(extent_of(o), body);
+    Vector<S, 2> plane_normal;
+    const S height = edge_height(o.data, o.numbers / 2, face, around.point, plane_normal, beyond);
+    normal = around.in_space(plane_normal);
+    return height;
+  }
+};
+
+// Known by its distance alone. Its numbers are the first node of the samples [D], their distance, numbers of them along
+// each axis [D], and the samples, the last axis fastest.
+struct SampledShape : OneFace<SampledShape> {
+  template <class S, int D>
+  MPM_HD static S surface(const ObstaclePose<S, D>& o, const Vector<S, D>& body, Vector<S, D>& normal,
+                          ValueOf<S>& second) {
+    second = std::numeric_limits<ValueOf<S>>::lowest();
+    return sampled_surface(o.data, o.numbers, body, normal);
+  }
+};
+
+// Calls a function with the struct of a shape.
+template <class F>
+MPM_HD auto visit_shape(ObstacleShape shape, F&& f) {
+  switch (shape) {
+    case ObstacleShape::plane:
+      return f(PlaneShape());
+    case ObstacleShape::box:
+      return f(BoxShape());
+    case ObstacleShape::capsule:
+      return f(CapsuleShape());
+    case ObstacleShape::revolved:
+      return f(RevolvedShape());
+    case ObstacleShape::sampled:
+      return f(SampledShape());
+    case ObstacleShape::torus:
+      return f(TorusShape());
+    default:
+      return f(SphereShape());
+  }
+}
+
+// Signed distance of a point in body coordinates, and the unit normal out of the body: right inside, zero where the
+// shape has none. Outside, the distance is a lower bound. `second` is the distance of a second face of the shape, where
+// its faces may join at inner edges: the least number where they are not known one by one, and else the largest.
+template <class S, int D>
+MPM_HD S surface(const ObstaclePose<S, D>& o, const Vector<S, D>& body, Vector<S, D>& normal, ValueOf<S>& second) {
+  second = std::numeric_limits<ValueOf<S>>::max();
+  return visit_shape(o.shape, [&](auto shape) { return decltype(shape)::surface(o, body, normal, second); });
+}
+
+template <class S, int D>
+MPM_HD S surface(const ObstaclePose<S, D>& o, const Vector<S, D>& body, Vector<S, D>& normal) {
+  ValueOf<S> second;
+  return surface(o, body, normal, second);
+}
+
+// ---- the faces of a shape, which contact of several obstacles looks at one by one
+
+template <int D>
+MPM_HD int face_count(const ObstacleKind& o) {
+  return visit_shape(o.shape, [&](auto shape) { return decltype(shape)::template face_count<D>(o.numbers); });
+}
+
+// Whether the height above a face is linear in the position.
+template <int D>
+MPM_HD bool is_flat(ObstacleShape shape) {
+  return visit_shape(shape, [](auto shape) { return decltype(shape)::template flat<D>; });
+}
+
+// Height of a point in body coordinates above the surface that carries a face, and the unit normal of that; `beyond` is
+// about how far the foot of the point is from the face itself, as far as that is known. Face −1 is the nearest one, the
+// only one whose number `surface` needs.
+template <class S, int D>
+MPM_HD S face_height(const ObstaclePose<S, D>& o, int face, const Vector<S, D>& body, Vector<S, D>& normal,
+                     ValueOf<S>& beyond) {
+  beyond = ValueOf<S>(0);
+  if (face < 0) return surface(o, body, normal);
+  return visit_shape(o.shape, [&](auto shape) { return decltype(shape)::face_height(o, face, body, normal, beyond); });
+}
+
+}  // namespace TORCH_MPM_ISA
+}  // namespace mpm

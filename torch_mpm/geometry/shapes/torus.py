@@ -1,0 +1,79 @@
+"""Rings."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .. import surface_mesh
+from ..per_scene import Value, direction, extent
+from ..surface_mesh import Array, SurfaceMesh
+from ..vectors import norm, unit
+from .base import Faces, SceneKey, SceneWords, Shape, around_origin, ball_volume, one_face
+
+
+class Torus(Shape):
+    """All points within a radius of a circle around the origin; in 2-D two discs.
+
+    Args:
+        ring: axis of the circle, as long as the radius of the circle [m]: D numbers, or a tensor [D] or [B, D].
+        radius: [m], a number, or a tensor [] or [B]; below the radius of the circle.
+    """
+
+    name = "torus"
+    RANKS: ClassVar = {"ring": 1, "radius": 0}
+    arguments = ("ring", "radius")
+    is_smooth = True
+    number, vector = 6, "ring"
+    words = SceneWords(
+        "Ring: all points near a circle; in 2-D two discs.",
+        {
+            "center": SceneKey("point", "centre of the circle [m]"),
+            "axis": SceneKey("vector", "direction of the axis of the circle"),
+            "ring_radius": SceneKey("length", "radius of the circle [m]"),
+            "radius": SceneKey("length", "distance from the circle [m]; below its radius"),
+        },
+    )
+
+    def __init__(self, ring: Value, radius: float | Tensor) -> None:
+        self.ring, self.radius = direction("ring", ring), extent("radius", radius)
+        if not (isinstance(self.ring, Tensor) or isinstance(self.radius, Tensor)):
+            if not self.radius < math.hypot(*self.ring):
+                raise ValueError(f"radius must be below that of the circle, {math.hypot(*self.ring):g} m, got {radius}")
+
+    def surface(self, x: Tensor, scene: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        ring = self.at_nodes("ring", x, x.shape[1:], scene)
+        axis = unit(ring)
+        along = (x * axis).sum(1, keepdim=True)
+        across = x - along * axis
+        offset = torch.cat([norm(across)[:, None] - norm(ring).unsqueeze(-1), along], 1)
+        normal = unit(offset)
+        distance = norm(offset) - self.at_nodes("radius", x, (), scene)
+        return distance, normal[:, :1] * unit(across) + normal[:, 1:] * axis
+
+    def surface_faces(self, x: Tensor, scene: Tensor | None = None) -> Faces:
+        return one_face(*self.surface(x, scene), False)
+
+    def volume(self, dim: int, scene: int = 0) -> float:
+        """By Pappus's theorem."""
+        section = ball_volume(2, float(self.of_scene("radius", 0, scene)))
+        return section * (2 if dim == 2 else 2 * math.pi * float(self.of_scene("ring", 1, scene).norm()))
+
+    def bounds(self, dim: int, scene: int = 0) -> tuple[Tensor, Tensor]:
+        ring, radius = self.of_scene("ring", 1, scene), self.of_scene("radius", 0, scene)
+        return around_origin((ring.square().sum() - ring.square()).clamp_min(0).sqrt() + radius)
+
+    def mesh(self, lower: Array, upper: Array, scene: int = 0) -> list[SurfaceMesh]:
+        ring, radius = self.of_scene("ring", 1, scene).numpy(), float(self.of_scene("radius", 0, scene))
+        away, angle = np.linalg.norm(ring), np.linspace(0, 2 * np.pi, surface_mesh.TURNS, endpoint=False)
+        outline = np.stack([away + radius * np.cos(angle), radius * np.sin(angle)], 1)
+        return surface_mesh.ring(outline, ring / away)
+
+    @classmethod
+    def from_words(cls, words: Any) -> tuple[Shape, Any]:
+        size = words.ring_radius / math.hypot(*words.axis)
+        return cls([size * a for a in words.axis], words.radius), words.center
