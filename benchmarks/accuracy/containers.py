@@ -7,9 +7,12 @@ Water starts at rest under its own pressure. Particles count as outside when the
 a wall, or beyond the container. The force is the vertical momentum that obstacles and walls take in the last fifth of
 the time, over that of the weight. The pressure is the volume average over layers of particles at least dx away from
 obstacles and 1.5 dx below the surface, over the weight per area of the water above in a column that is open to the
-surface; the table has the least-squares factor between the two. A tank of walls of the domain, without obstacles, is
-the reference for both. Averages are over records of the last fifth of the time. The block slides without friction and
-should keep its speed.
+surface; the table has the least-squares factor between the two. The stress is that per volume of the column, averaged
+with a hat function of height 4 dx: the pressure times the volume of the particles there over the volume of the column,
+which balances the weight. The filling is the volume of these particles over that of the column: the volume that
+particles store drifts from that which they take up, and their pressure with it. A tank of walls of the domain, without
+obstacles, is the reference. Averages are over records of the last fifth of the time. The block slides without friction
+and should keep its speed.
 """
 
 from __future__ import annotations
@@ -179,6 +182,8 @@ def run(case: Container, dx: float, duration: float) -> dict[str, Any]:
         "outside": left,
         "force": -float(taken) / (weight * 0.2 * duration),
         "pressure": profile.factor(),
+        "stress": profile.stress(),
+        "filling": profile.filling(),
         "speed": float(state.v.norm(dim=1).mean()),
         "seconds": time.perf_counter() - begin,
     }
@@ -213,10 +218,11 @@ def distance(obstacles: list[Any], x: Tensor) -> Tensor:
 
 
 class Profile:
-    """Layers of pressure, and the weight above them."""
+    """Layers of pressure, and the weight above them; stress, filling and weight in parts of the column [n, 3]."""
 
     def __init__(self, case: Container, dx: float) -> None:
         self.case, self.dx = case, dx
+        self.parts: list[list[float]] = []
         self.edges = np.arange(0.0, 1.5 * DEPTH, 0.5 * dx)
         self.mass, self.volume, self.work = (np.zeros(len(self.edges) - 1) for _ in range(3))
         self.records = 0
@@ -231,11 +237,36 @@ class Profile:
         inner = (distance(obstacles, state.x) > self.dx) & (x[:, 1] > self.case.floor(x) + self.dx)
         volume = state.volume.double() * J
         self.volume += self._sum(x[inner], volume[inner])
-        self.work += self._sum(x[inner], (volume * BULK / GAMMA * (J**-GAMMA - 1))[inner])
+        work = volume * BULK / GAMMA * (J**-GAMMA - 1)
+        self.work += self._sum(x[inner], work[inner])
         self.records += 1
+        self._add_parts(x[column, 1], volume[column], work[column], state.mass[column].double())
+
+    def _add_parts(self, y: Tensor, volume: Tensor, work: Tensor, mass: Tensor) -> None:
+        middle, half = self.case.column
+        edge = torch.zeros(1, self.case.dim, dtype=torch.float64)
+        edge[:, ::2] = half
+        edge[:, 0] += middle
+        reach, area = 2 * self.dx, (2 * half) ** (self.case.dim - 1)
+        height = float(self.case.floor(edge)) + reach
+        while height + reach < float(y.max()) - 1.5 * self.dx:
+            away = ((y - height) / reach).clamp(-1, 1)
+            share = (1 - away.abs()) / reach
+            below = 0.5 + away - 0.5 * away * away.abs()  # its integral up to y
+            sums = (work * share).sum(), (volume * share).sum(), GRAVITY * (mass * below).sum()
+            self.parts.append([float(v) / area for v in sums])
+            height += 0.5 * self.dx
 
     def _sum(self, x: Tensor, value: Tensor) -> np.ndarray:
         return np.histogram(x[:, 1].numpy(), self.edges, weights=value.double().numpy())[0]
+
+    def stress(self) -> float:
+        """Of the least squares between stress and weight above; NaN where the water is too low for a part."""
+        stress, _, weight = np.array(self.parts).reshape(-1, 3).T
+        return float((stress * weight).sum() / (weight * weight).sum()) if self.parts else math.nan
+
+    def filling(self) -> float:
+        return float(np.mean([filling for _, filling, _ in self.parts])) if self.parts else math.nan
 
     def factor(self) -> float:
         """Of the least squares between pressure and weight above."""
@@ -274,7 +305,8 @@ def measure(cases: Sequence[Container], dx: float, duration: float) -> dict[str,
         result["cases"].append(found)
         print(
             f"{found['name']}: {found['outside']} of {found['particles']} particles outside, force "
-            f"{found['force']:.4f}, pressure {found['pressure']:.4f}, {found['seconds']:.0f} s",
+            f"{found['force']:.4f}, pressure {found['pressure']:.4f}, stress {found['stress']:.4f}, filling "
+            f"{found['filling']:.4f}, {found['seconds']:.0f} s",
             flush=True,
         )
     result["block"] = slide(10, dx, min(1.0, duration))
@@ -286,11 +318,15 @@ def text(result: dict[str, Any]) -> str:
     lines = ["# Water in containers", "", common.describe(result["environment"]), ""]
     lines += [(__doc__ or "").split("\n\n", 2)[2].strip(), ""]
     lines += [f"dx = {result['dx']:g} m, {result['duration']:g} s, float32.", ""]
-    header = ("container", "particles", "steps", "outside", "force", "pressure", "mean speed m/s", "seconds")
+    header = (
+        *("container", "particles", "steps", "outside", "force", "pressure", "stress", "filling"),
+        *("mean speed m/s", "seconds"),
+    )
     rows = [
         (
             *(c["name"], c["particles"], c["steps"], c["outside"]),
-            *(f"{c['force']:.4f}", f"{c['pressure']:.4f}", f"{c['speed']:.4f}", f"{c['seconds']:.0f}"),
+            *(f"{c[name]:.4f}" for name in ("force", "pressure", "stress", "filling", "speed")),
+            f"{c['seconds']:.0f}",
         )
         for c in result["cases"]
     ]

@@ -140,8 +140,7 @@ struct AroundAxis {
   MPM_HD Vector<S, D> in_space(const Vector<S, 2>& v) const { return v[0] * across + v[1] * axis; }
 };
 
-// What most shapes have: one curved face, the surface.
-template <class Shape>
+// What most shapes have: one curved face, the surface, whose number is −1.
 struct OneFace {
   // Whether the height above a face is linear in the position.
   template <int D>
@@ -152,14 +151,13 @@ struct OneFace {
     return 1;
   }
   template <class S, int D>
-  MPM_HD static S face_height(const ObstaclePose<S, D>& o, int, const Vector<S, D>& body, Vector<S, D>& normal,
-                              ValueOf<S>&) {
-    ValueOf<S> second;
-    return Shape::surface(o, body, normal, second);
+  MPM_HD static S face_height(const ObstaclePose<S, D>&, int, const Vector<S, D>&, Vector<S, D>& normal, ValueOf<S>&) {
+    normal = zero_vector<S, D>();
+    return S(std::numeric_limits<ValueOf<S>>::max());
   }
 };
 
-struct PlaneShape : OneFace<PlaneShape> {
+struct PlaneShape : OneFace {
   template <int D>
   static constexpr bool flat = true;
 
@@ -179,14 +177,14 @@ MPM_HD S ball_surface(const Vector<S, D>& offset, const S& radius, Vector<S, D>&
   return distance - radius;
 }
 
-struct SphereShape : OneFace<SphereShape> {
+struct SphereShape : OneFace {
   template <class S, int D>
   MPM_HD static S surface(const ObstaclePose<S, D>& o, const Vector<S, D>& body, Vector<S, D>& normal, ValueOf<S>&) {
     return ball_surface(body, o.row->radius, normal);
   }
 };
 
-struct CapsuleShape : OneFace<CapsuleShape> {
+struct CapsuleShape : OneFace {
   template <class S, int D>
   MPM_HD static S surface(const ObstaclePose<S, D>& o, const Vector<S, D>& body, Vector<S, D>& normal, ValueOf<S>&) {
     const Vector<S, D> half = extent_of(o);
@@ -198,7 +196,7 @@ struct CapsuleShape : OneFace<CapsuleShape> {
 };
 
 // All points within a radius of a circle, whose axis is as long as its radius; in 2-D two discs.
-struct TorusShape : OneFace<TorusShape> {
+struct TorusShape : OneFace {
   template <class S, int D>
   MPM_HD static S surface(const ObstaclePose<S, D>& o, const Vector<S, D>& body, Vector<S, D>& normal, ValueOf<S>&) {
     const Vector<S, D> ring = extent_of(o);
@@ -279,7 +277,7 @@ struct RevolvedShape {
 
 // Known by its distance alone. Its numbers are the first node of the samples [D], their distance, numbers of them along
 // each axis [D], and the samples, the last axis fastest.
-struct SampledShape : OneFace<SampledShape> {
+struct SampledShape : OneFace {
   template <class S, int D>
   MPM_HD static S surface(const ObstaclePose<S, D>& o, const Vector<S, D>& body, Vector<S, D>& normal,
                           ValueOf<S>& second) {
@@ -338,8 +336,8 @@ MPM_HD bool is_flat(ObstacleShape shape) {
 }
 
 // Height of a point in body coordinates above the surface that carries a face, and the unit normal of that; `beyond` is
-// about how far the foot of the point is from the face itself, as far as that is known. Face −1 is the nearest one, the
-// only one whose number `surface` needs.
+// about how far the foot of the point is from the face itself, as far as that is known. Face −1 is the nearest one, and
+// that of shapes of one face.
 template <class S, int D>
 MPM_HD S face_height(const ObstaclePose<S, D>& o, int face, const Vector<S, D>& body, Vector<S, D>& normal,
                      ValueOf<S>& beyond) {
