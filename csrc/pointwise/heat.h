@@ -19,13 +19,13 @@ MPM_HD T safe_root(const T& squared) {
 }
 
 // Rest volume, J, F (either is the number one where the other gives the volume), C, κ, mass, dt, ∇v, dx to the present
-// volume V, heat capacity m C, conductance κ V, and the blend β = min(1, 4 r + dt |sym ∇v|) with the diffusion number
-// r. Where matter is strained, the gradient of the particle relaxes to that of the grid.
+// volume V, heat capacity m C, conductance κ V, the blend β = min(1, 4 r + dt |sym ∇v|), and the diffusion number r.
+// Where matter is strained, the gradient of the particle relaxes to that of the grid.
 struct HeatWeights {
   static constexpr const char* name = "heat_weights";
   static constexpr Entries arguments[] = {kScalar, kScalar, kMatrix, kScalar, kScalar,
                                           kScalar, kScalar, kMatrix, kScalar};
-  static constexpr Entries results[] = {kScalar, kScalar, kScalar, kScalar};
+  static constexpr Entries results[] = {kScalar, kScalar, kScalar, kScalar, kScalar};
 
   template <class T, int D>
   MPM_HD static void evaluate(Reader<T, D>& in, Writer<T, D>& out) {
@@ -48,6 +48,7 @@ struct HeatWeights {
     out.put(capacity);
     out.put(conductance);
     out.put(select(rate > T(1), T(1), rate));
+    out.put(r);
   }
 };
 
@@ -144,20 +145,21 @@ struct HeatUpdate {
   }
 };
 
-// θ, liquid fraction f, melting point θ_m, C, L: θ and f with the excess over the melting point moved into the latent
-// heat, or out of it (enthalpy buffer; Stomakhin et al. 2014).
+// θ, liquid fraction f, melting point θ_m, C, L, diffusion number r: θ and f with the excess over the melting point
+// moved into the latent heat, or out of it (enthalpy buffer; Stomakhin et al. 2014), and r where f changes, else zero.
 struct HeatMelt {
   static constexpr const char* name = "heat_melt";
-  static constexpr Entries arguments[] = {kScalar, kScalar, kScalar, kScalar, kScalar};
-  static constexpr Entries results[] = {kScalar, kScalar};
+  static constexpr Entries arguments[] = {kScalar, kScalar, kScalar, kScalar, kScalar, kScalar};
+  static constexpr Entries results[] = {kScalar, kScalar, kScalar};
 
   template <class T, int D>
   MPM_HD static void evaluate(Reader<T, D>& in, Writer<T, D>& out) {
     const T theta = in.scalar(), before = in.scalar(), melting_point = in.scalar();
-    const T specific_heat = in.scalar(), ratio = specific_heat / in.scalar();
+    const T specific_heat = in.scalar(), ratio = specific_heat / in.scalar(), r = in.scalar();
     const T liquid = clamp_to_unit(before + ratio * (theta - melting_point));
     out.put(theta - (liquid - before) / ratio);
     out.put(liquid);
+    out.put(select(liquid > before, r, select(liquid < before, r, T(0))));
   }
 };
 

@@ -14,7 +14,7 @@ def heat_weights(rest: Tensor, J: Tensor, F: Tensor, C: Tensor, kappa: Tensor, m
     capacity, conductance = C * mass, torch.where(kappa >= 0, kappa, torch.nan) * volume
     number = dt * conductance / (torch.where(capacity > 0, capacity, 1) * dx**2)
     strain = norm((0.5 * (L + L.mT)).flatten(1))
-    return volume, capacity, conductance, (4 * number + dt * strain).clamp(max=1)
+    return volume, capacity, conductance, (4 * number + dt * strain).clamp(max=1), number
 
 
 def heat_moments_1(theta: Tensor, g: Tensor, w: Tensor, share: Tensor) -> tuple[Tensor, ...]:
@@ -57,10 +57,11 @@ def _convected(g: Tensor, L: Tensor, dt: Tensor) -> Tensor:
     return g - first + (rate @ first[..., None])[..., 0]
 
 
-def heat_melt(theta: Tensor, liquid: Tensor, point: Tensor, C: Tensor, latent: Tensor) -> tuple[Tensor, ...]:
+def heat_melt(theta: Tensor, liquid: Tensor, point: Tensor, C: Tensor, latent: Tensor, number: Tensor,
+              ) -> tuple[Tensor, ...]:  # fmt: skip
     ratio = C / latent
     after = (liquid + ratio * (theta - point)).clamp(0, 1)
-    return theta - (after - liquid) / ratio, after
+    return theta - (after - liquid) / ratio, after, torch.where(after != liquid, number, 0)
 
 
 def heat_layer(distance: Tensor, width: Tensor) -> tuple[Tensor, ...]:

@@ -302,9 +302,26 @@ def obstacles_of(step: Any) -> Sequence[Obstacle]:
     Step, Obstacle = _classes()
     if not isinstance(step, torch.nn.Module):
         return []
-    if isinstance(step, Step) and step.heat is None and all(isinstance(b, Obstacle) for b in step.boundaries.entries):
+    if not isinstance(step, Step):
+        return _obstacles_in(step, {})
+    parts = [part for name, part in step._modules.items() if name != "law" and part is not None]
+    if len(parts) == 1 and all([isinstance(b, Obstacle) for b in step.boundaries.entries]):
         return step.boundaries.entries
-    return [m for m in step.modules() if isinstance(m, Obstacle)]
+    seen: dict[int, Any] = {}
+    return [obstacle for part in parts for obstacle in _obstacles_in(part, seen)]
+
+
+def _obstacles_in(module: Any, seen: dict[int, Any]) -> list[Obstacle]:
+    """Obstacles among a module and those inside it, but for `seen` ones, to which it adds them: as `modules`, which
+    takes longer than the kernels of a small scene."""
+    if id(module) in seen:
+        return []
+    seen[id(module)] = module
+    found = [module] if isinstance(module, _classes()[1]) else []
+    for inner in module._modules.values():
+        if inner is not None:
+            found += _obstacles_in(inner, seen)
+    return found
 
 
 @functools.cache

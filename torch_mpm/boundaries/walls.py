@@ -144,9 +144,9 @@ def _numbers(name: str, values: Sequence[float] | None) -> tuple[float, ...] | N
 
 def _frozen(value: Any) -> Any:
     """Nested sequences as tuples, which cannot change after `Walls` has read them."""
-    if isinstance(value, str) or not isinstance(value, Sequence):
+    if value is None or isinstance(value, (str, float)) or not isinstance(value, Sequence):
         return value
-    return tuple(_frozen(item) for item in value)
+    return tuple([_frozen(item) for item in value])
 
 
 def _flat(value: Any) -> list[Any]:

@@ -8,7 +8,7 @@ import warnings
 import torch
 from torch import Tensor
 
-from ..cuda_graphs.capture import outside_transforms, without_transforms
+from ..cuda_graphs.capture import DeviceConstantCache, outside_transforms, without_transforms
 from ..errors import FrontWarning
 
 LARGEST = 1.0
@@ -28,20 +28,25 @@ class FrontRecord:
 
     def __init__(self) -> None:
         self.largest: Tensor | None = None
+        self._scene_rows = DeviceConstantCache()
 
     @torch.no_grad()
-    def add(self, number: Tensor, before: Tensor, after: Tensor, scene: Tensor | None, scenes: int) -> None:
-        """Count one step, of particles with the given diffusion numbers and liquid fractions [P]."""
-        number, before, after = (without_transforms(t.detach()) for t in (number, before, after))
+    def add(self, number: Tensor, scene: Tensor | None, scenes: int) -> None:
+        """Count one step, with the diffusion numbers of the particles that changed their phase in it [P], zero of
+        others.
+        """
+        number = without_transforms(number.detach())
         with outside_transforms():
             if self.largest is None or self.largest.device != number.device or len(self.largest) != scenes:
                 with torch.inference_mode(False):
                     self.largest = torch.zeros(scenes, dtype=torch.float64, device=number.device)
             if not scenes or not len(number):
                 return
-            melts = torch.where(before != after, number, 0).double()
-            rows = torch.zeros_like(before, dtype=torch.int64) if scene is None else scene.long().clamp(0, scenes - 1)
-            self.largest.scatter_reduce_(0, rows, melts, "amax")
+            if scene is None:
+                torch.maximum(self.largest, number.amax(), out=self.largest)
+                return
+            rows = self._scene_rows.get((scene, scenes), lambda: scene.long().clamp(0, scenes - 1), number)
+            self.largest.scatter_reduce_(0, rows, number.to(self.largest.dtype), "amax")
 
     def warn(self) -> None:
         """Warn of fronts with too long steps; waits for the device.

@@ -231,8 +231,15 @@ class Heat(nn.Module):
         specific_heat = evaluate("specific_heat", self.specific_heat, state)
         conductivity = evaluate("conductivity", self.conductivity, state)
         matter = *_deformation(state), specific_heat, conductivity, state.mass
-        volume, heat_capacity, conductance, varying = pointwise(
-            "heat_weights", self.grid.dim, state.volume, *matter, step, motion, self.grid.dx
+        volume, heat_capacity, conductance, varying, *number = pointwise(
+            "heat_weights",
+            self.grid.dim,
+            state.volume,
+            *matter,
+            step,
+            motion,
+            self.grid.dx,
+            wanted=range(4 + self.melts),
         )
         blend = varying if self.transfer == "hybrid" else 0.0 if self.transfer == "flip" else 1.0
         weights = (heat_capacity,) if isinstance(blend, float) else (heat_capacity, blend)
@@ -252,10 +259,8 @@ class Heat(nn.Module):
         if gradient is not None:
             extra[GRADIENT] = gradient
         if self.melts:
-            solid = extra[LIQUID]
-            theta, extra[LIQUID] = self._melt(state, specific_heat, theta, solid)
-            number = conductance * step / (heat_capacity * self.grid.dx**2)
-            self.fronts.add(number, solid, extra[LIQUID], state.scene, self.grid.scenes)
+            theta, extra[LIQUID], changing = self._melt(state, specific_heat, theta, extra[LIQUID], number[0].detach())
+            self.fronts.add(changing, state.scene, self.grid.scenes)
         return {"temperature": theta, "extra": extra} if extra else {"temperature": theta}
 
     def _check_parameters(self, particles: int) -> None:
@@ -330,15 +335,15 @@ class Heat(nn.Module):
         return (temperature.detach() > evaluate("melting_point", self.melting_point, state)).to(temperature)
 
     def _melt(
-        self, state: State, specific_heat: Tensor | float, theta: Tensor, liquid: Tensor
-    ) -> tuple[Tensor, Tensor]:
+        self, state: State, specific_heat: Tensor | float, theta: Tensor, liquid: Tensor, number: Tensor
+    ) -> Sequence[Tensor]:
         """Temperature and liquid fraction with the excess over the melting point moved into the latent heat, or out of
-        it.
+        it; and the diffusion numbers of the particles where that changes the fraction, else zero.
         """
         melting_point = evaluate("melting_point", self.melting_point, state)
         latent_heat = evaluate("latent_heat", self.latent_heat, state)
-        theta, liquid = pointwise("heat_melt", self.grid.dim, theta, liquid, melting_point, specific_heat, latent_heat)
-        return theta, liquid
+        matter = melting_point, specific_heat, latent_heat
+        return pointwise("heat_melt", self.grid.dim, theta, liquid, *matter, number)
 
     def heat_content(self, state: State) -> Tensor:
         """m (C θ + L f) of each particle [P] [J], relative to the solid at the reference temperature.

@@ -297,9 +297,10 @@ class CompiledLaw(Material):
         return deformation, parameters
 
     def check_parameters(self, particles: int, scenes: int | None) -> None:
-        for name, value in self._stored():
-            if isinstance(value, (Tensor, PerMaterial)):
-                check_length(ARGUMENTS.get(name, name), value, particles, scenes)
+        for values in (self._parameters, self._buffers, self._modules):
+            for name, value in values.items():
+                if isinstance(value, (Tensor, PerMaterial)):
+                    check_length(ARGUMENTS.get(name, name), value, particles, scenes)
 
     def _stored(self) -> list[tuple[str, Any]]:
         """Attributes that may be parameters, by the names under which they are stored; in compiled code only registered
@@ -308,7 +309,7 @@ class CompiledLaw(Material):
         registered = [*self._parameters.items(), *self._buffers.items(), *self._modules.items()]
         if torch.compiler.is_compiling():
             return registered
-        return [*registered, *((name, value) for name, value in vars(self).items() if type(value) not in _NO_VALUES)]
+        return registered + [item for item in vars(self).items() if type(item[1]) not in _NO_VALUES]
 
     def _parameters_of(self, state: State) -> list[Tensor]:
         """Parameters in the dtype, on the device and in the particle order of the state.
@@ -318,16 +319,19 @@ class CompiledLaw(Material):
         if self._functions:
             in_order: Any = Overlay(state, ids=None)  # Evaluated parameters have this form already.
             return self._at_temperature(state)._convert(in_order)
-        stored = [value for _, value in self._stored()]
-        tensors = [value for value in stored if isinstance(value, Tensor)]
+        tensors, numbers = [], []
+        for _, value in self._stored():
+            if isinstance(value, Tensor):
+                tensors.append(value)
+            elif isinstance(value, (float, int, Real)):
+                numbers.append(value)
         x, order = state.x, None
         particles = getattr(state, "particles", x.shape[0])
-        if not all(needs_no_scenes(t, particles) for t in tensors):
+        if not all([needs_no_scenes(t, particles) for t in tensors]):
             self.check_parameters(particles, state.scenes)
-        if torch.compiler.is_compiling() or any(t.requires_grad for t in tensors):
+        if torch.compiler.is_compiling() or any([t.requires_grad for t in tensors]):
             return self._convert(state)
-        numbers = [value for value in stored if not isinstance(value, Tensor) and isinstance(value, (float, int, Real))]
-        if any(t.numel() == particles for t in tensors):
+        if any([t.numel() == particles for t in tensors]):
             order = state.ids  # Only parameters that differ by particle.
         key = (x.dtype, x.device, order, *numbers, *tensors)
         return self._kept_parameters.get(key, lambda: self._convert(state), x)

@@ -71,13 +71,24 @@ def pointwise(function: str, dim: int, *arguments: Tensor | float, wanted: Seque
         KeyError: for an unknown function.
         RuntimeError: for a wrong shape, dtype or device.
     """
-    device = next((a.device for a in arguments if isinstance(a, Tensor) and a.dim() > 0), None)
-    arguments = tuple(_beside(a, device) if isinstance(a, Tensor) and a.dim() == 0 else a for a in arguments)
-    tensors = [a for a in arguments if isinstance(a, Tensor)]
-    places = [k for k, a in enumerate(arguments) if isinstance(a, Tensor)]
-    numbers = [0.0 if isinstance(a, Tensor) else float(a) for a in arguments]
+    tensors: list[Tensor] = []
+    places: Places = []
+    numbers: list[float] = []
+    for k, argument in enumerate(arguments):
+        if isinstance(argument, Tensor) and argument.dim() == 0:
+            argument = _beside(argument, _device_of_rows(arguments))
+        if isinstance(argument, Tensor):
+            tensors.append(argument)
+            places.append(k)
+            numbers.append(0.0)
+        else:
+            numbers.append(float(argument))
     results = list(range(len(FUNCTIONS[function].results))) if wanted is None else list(wanted)
     return list(dispatch(torch.ops.torch_mpm.pointwise, function, dim, tensors, places, numbers, results))
+
+
+def _device_of_rows(arguments: Sequence[Any]) -> torch.device | None:
+    return next((a.device for a in arguments if isinstance(a, Tensor) and a.dim() > 0), None)
 
 
 def _beside(scalar: Tensor, device: torch.device | None) -> Tensor | float:
