@@ -137,10 +137,11 @@ def obstacle_arguments(
     table: tuple[Tensor | None, Tensor | None] = (None, None)
     if group:
         table = tables(group, like, scenes) if times is None else tables_over(group, like, scenes, times)
+    forms = [o.shape for o in group]
     return (
         *table,
-        [o.shape.number for o in group],
-        [o.shape.data_count() for o in group],
+        [shape.number for shape in forms],
+        [shape.data_count() for shape in forms],
         [CONTACT_KINDS[o.kind] for o in group],
         [-1 if o.scene is None else o.scene for o in group],
         [o.start for o in group],

@@ -19,7 +19,7 @@ def tables(obstacles: Sequence[Obstacle], like: Tensor, scenes: int) -> tuple[Te
     """Parameters [1 or B, K, width] and data [n] of the shapes; cached while nothing has changed."""
     if torch.compiler.is_compiling() or type(like) not in (Tensor, torch.nn.Parameter):
         return _build(obstacles, like, scenes)
-    values = [v for o in obstacles for v in (o, o.shape, *_values(o))]
+    values = [v for o in obstacles for v in _values(o)]
     if torch.is_grad_enabled() and any(isinstance(v, Tensor) and v.requires_grad for v in values):
         return _build(obstacles, like, scenes)
     key = like.dtype, like.device, scenes, *values
@@ -37,10 +37,10 @@ def tables_over(obstacles: Sequence[Obstacle], like: Tensor, scenes: int, times:
 
 
 def _values(obstacle: Obstacle) -> tuple[Any, ...]:
-    """Numbers and tensors of an obstacle that enter the tables."""
+    """An obstacle, its shape, and the numbers and tensors of both that enter the tables."""
     moved, shape = obstacle.motion, obstacle.shape
     motion = (obstacle.friction, moved.position, moved.velocity, moved.rotation, moved.angular_velocity)
-    return (*motion, *(getattr(shape, name) for name in shape.arguments))
+    return (obstacle, shape, *motion, *[getattr(shape, name) for name in shape.arguments])
 
 
 def _build(obstacles: Sequence[Obstacle], like: Tensor, scenes: int) -> tuple[Tensor, Tensor]:

@@ -118,7 +118,8 @@ def substeps_arguments(
     check_state(state)
     if (reason := why_not_fused(step, state, dt)) is not None:
         raise ValueError(f"step must be one that `substeps` supports, got a step that it does not: {reason}")
-    return _arguments(step, step.with_residual(step.prepare(state), dt), n, dt, records, blocks)[0]
+    arguments, _ = _arguments(step, step.with_residual(step.prepare(state), dt), n, dt, records, blocks)
+    return dict(zip(ARGUMENTS, arguments, strict=True))
 
 
 def _arguments(
@@ -129,7 +130,7 @@ def _arguments(
     records: bool,
     blocks: int | None,
     schedule: str | None = None,
-) -> tuple[dict[str, Any], list[list[str]]]:
+) -> tuple[tuple[Any, ...], list[list[str]]]:
     """Arguments of the op in its order, and the names of the history of each law, for a prepared state."""
     grid, law, boundaries = step.grid, step.law, step.boundaries.entries
     number, scene_dt, scene_time = clocks(state, dt, grid.scenes)
@@ -156,7 +157,7 @@ def _arguments(
         *(state.impulse, scene_dt, scene_time, *grid.packed),
         -1 if schedule is None else SCHEDULES.index(schedule),
     )
-    return dict(zip(ARGUMENTS, arguments, strict=True)), calls.history_names
+    return arguments, calls.history_names
 
 
 def _substeps(
@@ -167,7 +168,7 @@ def _substeps(
     record.begin(state, grid.scenes)
     arguments, history_names = _arguments(step, state, n, dt, records, blocks, schedule)
     x, v, C, F, J, history, status, impulse, time, residual, _ = interruptible(
-        dispatch, torch.ops.torch_mpm.substeps, *arguments.values()
+        dispatch, torch.ops.torch_mpm.substeps, *arguments
     )
     record.follow(record.status, status)
     grid.watch(status)
