@@ -238,6 +238,25 @@ def test_frames_are_those_of_the_plan(device):
             mpm.frames(step, state, 10, DT, every=5, schedule="per_step", plan=plan)
 
 
+def test_a_rollout_to_a_time_follows_a_plan(device):
+    step, state = elastic(device)
+    with torch.no_grad():
+        ends = []
+        for options in ({}, {"schedule": "per_step"}):
+            plan = mpm.plan_rollout(step, state, 8, torch.full((1,), DT).to(state.x), **options)
+            ends += [mpm.rollout_to(step, state, 100 * DT, every=8, **named) for named in (options, {"plan": plan})]
+        assert SCHEDULES[torch.ops.torch_mpm.latest_schedule(state.x)] == plan.schedule == "per_step"
+        assert all(torch.equal(ends[0].substeps, end.substeps) for end in ends)
+        for end in ends[1:]:
+            torch.testing.assert_close(end.state.x, ends[0].state.x)
+        with pytest.raises(ValueError, match="checkpoint and schedule must be None with a plan"):
+            mpm.rollout_to(step, state, DT, schedule="per_step", plan=plan)
+        with pytest.raises(TypeError, match="plan must be a RolloutPlan or None, got int"):
+            mpm.rollout_to(step, state, DT, plan=3)
+        with pytest.raises(ValueError, match="schedule must be one of"):
+            mpm.rollout_to(step, state, 100 * DT, schedule="fastest")
+
+
 def test_plans_of_steps_from_python(device):
     step, state = elastic(device, on_grid=lambda blocks, v, m, dt: v)
     plan = mpm.plan_rollout(step, state, 20, DT, graph=4)

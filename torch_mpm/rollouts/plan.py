@@ -180,6 +180,11 @@ class RolloutPlan:
         return "\n".join([self.headline(), *others])
 
 
+def check_plan(plan: Any) -> None:
+    if not isinstance(plan, RolloutPlan):
+        raise TypeError(f"plan must be a RolloutPlan or None, got {shape_of(plan)}")
+
+
 def plan_rollout(
     step: Callable[[State, float | Tensor], State],
     state: State,

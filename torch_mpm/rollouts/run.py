@@ -20,7 +20,7 @@ from .gradient_norms import GradientNorms
 from .graph_replay import replayed
 from .graph_segments import graphed_steps
 from .hooks import Hook, Parts
-from .plan import RolloutPlan, plan_of_steps, why_not_fused
+from .plan import RolloutPlan, check_plan, plan_of_steps, why_not_fused
 from .steps import Steps
 
 
@@ -129,8 +129,7 @@ def _in_parts(steps: Steps, state: State, parts: Parts, plan: RolloutPlan | None
 
 def _as_planned(steps: Steps, plan: RolloutPlan) -> Steps:
     """Steps with the checkpoints, graphs and schedule that a plan was made for."""
-    if not isinstance(plan, RolloutPlan):
-        raise TypeError(f"plan must be a RolloutPlan or None, got {shape_of(plan)}")
+    check_plan(plan)
     graph = plan.steps_per_call if plan.executor == "graph" else None
     schedule = plan.schedule if plan.forced else None
     return steps._replace(checkpoints=plan.checkpoints, graph=graph, schedule=schedule)

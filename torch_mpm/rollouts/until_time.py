@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,7 +17,7 @@ from ..step.step import Step
 from .checkpoints import Checkpoints
 from .fused_op import in_calls
 from .graph_replay import CHUNK, replay_all
-from .plan import RolloutPlan, facts_of, follows_paths, plan_call, plan_of_steps
+from .plan import RolloutPlan, check_plan, facts_of, follows_paths, plan_call, plan_of_steps
 from .run import rollout
 from .sorting import restore_order, sort_particles
 from .steps import Steps
@@ -66,6 +66,8 @@ def rollout_to(
     most: int = MOST_SUBSTEPS,
     checkpoint: int | Checkpoints | None = None,
     previous: float | Tensor | None = None,
+    schedule: str | None = None,
+    plan: RolloutPlan | None = None,
 ) -> RolloutToResult:
     """Advance every scene to a given time, in substeps of its own length and number.
 
@@ -92,6 +94,9 @@ def rollout_to(
         checkpoint: as in `rollout`, for each segment.
         previous: dt of the previous substep [s], a number, or a tensor [], [1] or [B], for consecutive calls:
             `arrival.dt` of the previous call. None, or zero, for none.
+        schedule: schedule of the fused op, as in `rollout`, for each segment.
+        plan: the plan of `plan_rollout` for `every` steps with a tensor dt [B], in place of `checkpoint` and
+            `schedule`.
 
     Returns:
         The state, and for each scene whether it has arrived, its number of substeps, its largest CFL number and its
@@ -108,14 +113,19 @@ def rollout_to(
     check_number("longest", longest, "positive", lambda v: v > 0)
     check_count("every", every, 1)
     check_count("most", most, 1)
+    if plan is not None:
+        check_plan(plan)
+        if not (checkpoint is None and schedule is None):
+            raise ValueError("checkpoint and schedule must be None with a plan, which has them")
+    options = {"checkpoint": checkpoint, "schedule": schedule} if plan is None else {"plan": plan}
     given = _compensated(step, step.prepare(state), cfl, longest)
     unsorted = plan_call(None, facts_of(Steps(step, 1, 1.0), given)._replace(steps=most)).order > 0
     start = sort_particles(step, given) if unsorted else given
     clocks = Clocks(step, start, time, cfl, longest, most, previous)
     with control_step(step, start, most, PACE, clocks.seconds) as left:
         while (counts := clocks.remaining()) and counts[-1] > every:
-            clocks.advance(min((counts[-1] - 1) // every, MOST_SEGMENTS), every, checkpoint)
-        clocks.finish(counts, checkpoint)
+            clocks.advance(min((counts[-1] - 1) // every, MOST_SEGMENTS), every, options)
+        clocks.finish(counts, options)
         arrival = clocks.arrival()
         arrival = arrival._replace(state=left(arrival.state))
     return arrival._replace(state=restore_order(step, arrival.state, start, given)) if unsorted else arrival
@@ -168,13 +178,13 @@ class Clocks:
         self._choose(self.state)
         return [count for count in self._left.unique().tolist() if count > 0]
 
-    def advance(self, segments: int, n: int, checkpoint: int | Checkpoints | None) -> None:
-        """Segments of n substeps each, for scenes with more than n remaining substeps."""
-        plan = self._plan_of_replays(n) if segments > LEAST_REPLAYS else None
+    def advance(self, segments: int, n: int, options: dict[str, Any]) -> None:
+        """Segments of n substeps each, for scenes with more than n remaining substeps; options of `rollout`."""
+        plan = self._plan_of_replays(n, options) if segments > LEAST_REPLAYS else None
         if plan is None:
             for _ in range(segments):
                 state, dt = self._next(self.state, n)
-                self.state = rollout(self.step, state, n, dt, checkpoint)
+                self.state = rollout(self.step, state, n, dt, **options)
             return
 
         def segment(state: State) -> State:
@@ -184,21 +194,23 @@ class Clocks:
         # The first one allocates the records of steps.
         self.state = replay_all(self.step, segment, segment(self.state), segments - 1, max(CHUNK // n, 1))
 
-    def finish(self, counts: list[int], checkpoint: int | Checkpoints | None) -> None:
-        """Last substeps of each scene, as counted by `remaining`."""
+    def finish(self, counts: list[int], options: dict[str, Any]) -> None:
+        """Last substeps of each scene, as counted by `remaining`; options of `rollout`."""
         taken = 0
         for count in counts:
             dt = torch.where(self._left >= count, self._dt, 0.0).to(self.state.x.dtype)
-            self.state = rollout(self.step, self.state, count - taken, dt, checkpoint)
+            self.state = rollout(self.step, self.state, count - taken, dt, **options)
             taken = count
         self._take(self._left)
 
-    def _plan_of_replays(self, n: int) -> RolloutPlan | None:
+    def _plan_of_replays(self, n: int, options: dict[str, Any]) -> RolloutPlan | None:
         """The plan of a segment that is replayed as a CUDA graph; None if it cannot be recorded."""
         step, state = self.step, self.state
         if not state.x.is_cuda or follows_paths(step):
             return None
-        plan = plan_of_steps(Steps(step, n, self._dt.to(state.x.dtype)), state)
+        given: RolloutPlan | None = options.get("plan")
+        schedule = options.get("schedule") if given is None else given.schedule if given.forced else None
+        plan = plan_of_steps(Steps(step, n, self._dt.to(state.x.dtype), schedule=schedule), state)
         if plan.executor != "fused" or plan.facts is None or plan.facts.gradients:
             return None
         return plan.of_sorted()  # or not worth a sort
