@@ -319,7 +319,7 @@ class SolidAt {
 
   // Of a shape that is known by its distance alone, its surface, and the planes that free space sees around the point
   // nearest to the node: those of the faces that join there; and where that point is covered, or the node is beside the
-  // shape, those that neighbours of the node see.
+  // shape, those of the faces that neighbours of the node see.
   MPM_HD void add_by_distance(int k) {
     Face<T, D> nearest{k, -1, false, node_, {}, T(0), T(0)};
     nearest.height = height_of(k, node_, nearest.normal);
@@ -329,19 +329,37 @@ class SolidAt {
       const T spacing = spacing_of(k), small = T(2.5) * seam_,
               away = T(1.5) * spacing > small ? T(1.5) * spacing : small;
       const V first = node_ + nearest.depth * nearest.normal;
+      V unused;
+      const T start = height_of(k, first, unused);
+      // A node that is equally deep below several faces, one of which may be covered, has a normal between theirs, and
+      // that point is still inside. Samples round such ridges of distances by a quarter of their spacing.
+      const T slack = T(0.5) * seam_ + T(0.25) * spacing;
+      const bool ridge = start < T(0) - slack && has_others(k, nearest.depth);
       for (int i = 0; i < kLeaning; i++) {
         V normal;
         const V at = seen_from(k, first, nearest.normal, away, i);
         const T height = height_of(k, at, normal);
-        // The plane that it sees goes through that point or behind it where faces join; it is before a rounded body.
-        const bool joins = height + dot(normal, first + T(-1) * at) >= T(-0.5) * seam_;
-        nearest.flat = nearest.flat || (height >= T(0) && joins && dot(normal, nearest.normal) < T(kSame));
+        const T cosine = dot(normal, nearest.normal);
+        // The plane that it sees goes through that point or behind it where faces join; it is before a rounded body. At
+        // a ridge it is no deeper than the node.
+        const T lowest = ridge ? nearest.height * (T(1) - cosine) - slack : T(-0.5) * seam_;
+        const bool joins = height + dot(normal, first + T(-1) * at) >= lowest;
+        nearest.flat = nearest.flat || (height >= T(0) && joins && cosine < T(kSame));
       }
       if (!nearest.flat || is_a_face(k, first, nearest.normal)) add(nearest);
       for (int i = 0; nearest.flat && i < kLeaning; i++) add_plane(k, seen_from(k, first, nearest.normal, away, i));
-      covered = covered || is_covered(k, first, nearest.normal);
+      covered = covered || (ridge && nearest.flat) || is_covered(k, first, nearest.normal, start);
     }
     if (covered) add_seen_by_neighbours(k);
+  }
+
+  // Whether another obstacle, or a wall, is as near to the node as the surface that it is deep below.
+  MPM_HD bool has_others(int k, const T& depth) const {
+    const T away = 2 * seam_ + depth;
+    V normal;
+    for (uint64_t left = poses_.s.near & ~(uint64_t(1) << k); left; left &= left - 1)
+      if (height_of(lowest_bit(left), node_, normal) <= away) return true;
+    return nearest_wall(a_, node_) <= away;
   }
 
   // Whether a normal at a point of the surface is that of a face: at edges distances rise more slowly along it.
@@ -364,8 +382,18 @@ class SolidAt {
     for (int i = 1; i < count; i++) {
       V way;
       for (int j = 0, rest = i; j < D; j++, rest /= 3) way[j] = T(rest % 3 == 2 ? -1 : rest % 3);
-      add_plane(k, node_ + reach_ * (rotation * way));
+      const V at = node_ + reach_ * (rotation * way);
+      if (sees_a_face(k, at)) add_plane(k, at);
     }
+  }
+
+  // Whether the nearest point of the surface to a point is on a face: a step against the normal of an outer edge is
+  // less deep than it is long. Samples round edges.
+  MPM_HD bool sees_a_face(int k, const V& at) const {
+    const T spacing = spacing_of(k), step = spacing > seam_ ? spacing : seam_;
+    V normal, unused;
+    const T height = height_of(k, at, normal);
+    return height_of(k, at + (T(0) - height - step) * normal, unused) <= T(0) - T(kSame) * step;
   }
 
   // The plane that a point outside the shape sees, unless one with that normal is known.
@@ -476,11 +504,11 @@ class SolidAt {
   }
 
   // Whether a step of the height of a seam from a point that is nearest to the node leads into another obstacle, a
-  // wall, or deeper into its own obstacle. Values of an inexact distance rise there, even if that point is not on the
-  // surface.
-  MPM_HD bool is_covered(int k, const V& first, const V& normal) const {
+  // wall, or deeper into its own obstacle, at distance `height` from that. Values of an inexact distance rise there,
+  // even if that point is not on the surface.
+  MPM_HD bool is_covered(int k, const V& first, const V& normal, const T& height) const {
     V unused;
-    const T rise = height_of(k, first + seam_ * normal, unused) - height_of(k, first, unused);
+    const T rise = height_of(k, first + seam_ * normal, unused) - height;
     return !(rise > T(0.25) * seam_) || !is_free(first, normal, uint64_t(1) << k);
   }
 

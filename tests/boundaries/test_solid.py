@@ -96,7 +96,17 @@ def tank(dim: int, form: str, **options: object) -> list[Obstacle]:
             parts = boxes(dim, WALL, 0.0)
             distances = [functools.partial(part.signed_distance, scene=None, time=0.0) for part in parts]
             return [mpm.SDF(functools.partial(d), [0.0] * dim, **options) for d in distances]
+        case "samples of boxes":
+            return [Obstacle(sampled, [0.0] * dim, **options) for sampled in sampled_boxes(dim)]
     raise ValueError(form)
+
+
+@functools.cache
+def sampled_boxes(dim: int) -> list[shapes.Sampled]:
+    """Samples of the boxes, whose faces are on nodes of their lattice."""
+    lower, upper = [LOWER - WALL - DX] * dim, [UPPER + WALL + DX] * dim
+    distances = [obstacle.shape for obstacle in tank(dim, "sdf of boxes")]
+    return [shapes.Sampled.of(shape, lower, upper, 0.25 * DX) for shape in distances]
 
 
 FORMS = ["floor under walls", "floor between walls", "overlapping", "planes", "own shape", "sdf", "sdf of boxes"]
@@ -131,12 +141,10 @@ def expected_in_tank(blocks: mpm.Blocks, velocity: Tensor, kind: str) -> tuple[T
     return tested & (deep < (2.99 * DX) ** 2), after
 
 
-KINDS_AND_PLACES = [("separate", 0.0), ("slip", 0.4 * DX), ("sticky", 0.4 * DX)]
-BY_DISTANCE = [pytest.param(form, marks=pytest.mark.slow) if form == "sdf of boxes" else form for form in FORMS]
-"""That one takes long in 3-D."""
+KINDS_AND_PLACES = [("separate", 0.0), ("separate", 0.4 * DX), ("slip", 0.4 * DX), ("sticky", 0.4 * DX)]
 
 
-@pytest.mark.parametrize("form", BY_DISTANCE)
+@pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize(("kind", "at"), KINDS_AND_PLACES)
 def test_nodes_behind_a_corner_meet_all_its_faces(device, dim, form, kind, at):
     if dim == 3 and kind == "slip":
@@ -145,11 +153,48 @@ def test_nodes_behind_a_corner_meet_all_its_faces(device, dim, form, kind, at):
     tested, expected = expected_in_tank(blocks, velocity, kind)
     step = mpm.Step(blocks.grid, mpm.NeoHookean(E=1e5, nu=0.3), boundaries=tank(dim, form, kind=kind))
     obstacles = step.boundaries.entries
+    for after in in_every_way(blocks, velocity, obstacles):
+        torch.testing.assert_close(after[tested], expected[tested], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("form", ["floor under walls", "sdf of boxes", "samples of boxes"])
+@pytest.mark.parametrize("at", [0.0, 0.5 * DX])
+def test_nodes_equally_deep_below_two_faces_meet_the_free_one(device, dim, form, at):
+    """Nodes in walls that stand on the floor, as far from its level as from the tank: distances have a ridge there."""
+    if dim == 2 and at > 0:
+        pytest.skip("no block has such a node")
+    blocks, velocity = nodes(dim, device, at)
+    tested, expected = expected_in_tank(blocks, velocity, "slip")
+    x = blocks.node_positions(torch.float64)
+    depths = torch.maximum(LOWER - x, x - UPPER)
+    depths[:, 1] = -1
+    ridge = (depths.amax(1) - (x[:, 1] - LOWER)).abs() < 1e-9
+    tested = tested & ridge & ((depths > 0).sum(1) == 1)
+    obstacles = tank(dim, form, kind="slip")
+    assert bool(tested.any())
+    for after in in_every_way(blocks, velocity, obstacles):
+        torch.testing.assert_close(after[tested], expected[tested], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("form", ["floor under walls", "sdf of boxes", "samples of boxes"])
+def test_nodes_below_a_wall_meet_its_face_not_its_edge(device, dim, form):
+    """Nodes in the floor, of whose neighbours some see the lower edges of the walls that stand on it."""
+    blocks, velocity = nodes(dim, device, 0.4 * DX)
+    tested, expected = expected_in_tank(blocks, velocity, "separate")
+    x = blocks.node_positions(torch.float64)
+    tested = tested & (x[:, 1] < LOWER - 0.5 * DX)
+    obstacles = tank(dim, form, kind="separate")
+    assert bool(tested.any())
+    for after in in_every_way(blocks, velocity, obstacles):
+        torch.testing.assert_close(after[tested], expected[tested], rtol=0, atol=1e-9)
+
+
+def in_every_way(blocks: mpm.Blocks, velocity: Tensor, obstacles: list[Obstacle]) -> list[Tensor]:
+    """Velocities after contact in torch operations and, where it takes the obstacles, in the kernel, in both orders."""
     found = [in_torch(blocks, velocity, obstacles)]
     if all(mpm.ops.fusible(o, 0.0) for o in obstacles):
         found += [contact(blocks, velocity, given, 0.0) for given in (obstacles, obstacles[::-1])]
-    for after in found:
-        torch.testing.assert_close(after[tested], expected[tested], rtol=0, atol=1e-9)
+    return found
 
 
 def in_torch(

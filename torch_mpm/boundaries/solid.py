@@ -112,14 +112,12 @@ class SolidNodes:
             found.append(distance)
         return torch.stack(found, -1)
 
-    def is_covered(self, k: int, first: Tensor, normal: Tensor) -> Tensor:
-        """Whether a step of the height of a seam from points [N, D] that are nearest to nodes leads into another
-        obstacle, a wall, or deeper into their own obstacle [N]. Values of an inexact distance rise there, even if a
-        point is not on the surface."""
-        obstacle = self.obstacles[k]
-        ahead = obstacle.signed_distance(first + self.seam * normal, self.scene, self.time)
-        rise = ahead - obstacle.signed_distance(first, self.scene, self.time)
-        return ~(rise > 0.25 * self.seam) | ~self.is_free(first, normal, k)
+    def is_covered(self, k: int, node: _Nearest) -> Tensor:
+        """Whether a step of the height of a seam from the points that are nearest to nodes leads into another obstacle,
+        a wall, or deeper into their own obstacle [N]. Values of an inexact distance rise there, even if a point is not
+        on the surface."""
+        ahead = self.obstacles[k].signed_distance(node.first + self.seam * node.normal, self.scene, self.time)
+        return ~(ahead - node.start > 0.25 * self.seam) | ~self.is_free(node.first, node.normal, k)
 
     def is_free(self, at: Tensor, step: Tensor, but: int | None = None) -> Tensor:
         """Whether a step [N, D] of the height of a seam from points of surfaces [N, D] leads into free space [N], but
@@ -396,7 +394,7 @@ def _faces_near(solid: SolidNodes, x: Tensor, distance: Tensor) -> _Candidates:
         acts = distance[:, k] < torch.inf
         found = obstacle.faces_at(x, solid.scene, solid.time)
         if found is None:
-            _add_distance(solid, k, x, acts, add)
+            _add_distance(solid, k, x, distance, add)
             continue
         near = acts & (distance[:, k] <= solid.reach)
         alone = found.height.shape[1] == 1
@@ -410,14 +408,14 @@ def _faces_near(solid: SolidNodes, x: Tensor, distance: Tensor) -> _Candidates:
     return _Candidates(owner, face, flat, at, height.nan_to_num(posinf=0.0), normal, depth)
 
 
-def _add_distance(solid: SolidNodes, k: int, x: Tensor, acts: Tensor, add: Any) -> None:
+def _add_distance(solid: SolidNodes, k: int, x: Tensor, distance: Tensor, add: Any) -> None:
     """Faces of a shape that is known by its distance alone: its surface; where faces join at the point nearest to a
     node, the planes that free space sees around that; and where that point is covered, or the node is beside the shape,
-    those that neighbours of the node see."""
-    obstacle = solid.obstacles[k]
-    height, normal = obstacle.surface_at(x, solid.scene, solid.time)
-    sees = acts & (height <= solid.seam / 2) & (-height <= solid.reach) & ((normal * normal).sum(1) > 0.5)
-    nearest, first = sees, x - height[:, None] * normal
+    those of the faces that neighbours of the node see."""
+    obstacle, acts = solid.obstacles[k], distance[:, k] < torch.inf
+    node = _nearest(solid, k, x, distance)
+    height, normal, first = node.height, node.normal, node.first
+    sees = nearest = acts & (height <= solid.seam / 2) & (-height <= solid.reach) & ((normal * normal).sum(1) > 0.5)
     away = _away(solid, obstacle)
     around = [first + away * lean for lean in _leaning(normal)]
     seen = _surfaces(solid, obstacle, around)
@@ -430,21 +428,24 @@ def _add_distance(solid: SolidNodes, k: int, x: Tensor, acts: Tensor, add: Any) 
         seen = _surfaces(solid, obstacle, around)
     planes = [(at, above, toward) for at, (above, toward) in zip(around, seen, strict=True)]
     free = [plane[1] >= 0 for plane in planes]
-    differs = [there & _join(solid, first, normal, *plane) for there, plane in zip(free, planes, strict=True)]
+    differs = [there & _join(solid, node, *plane) for there, plane in zip(free, planes, strict=True)]
     joins = nearest & torch.stack(differs).any(0)
     wanted = [there & joins for there in free]
     if math.isfinite(solid.reach):
         beside = acts & (height > solid.rounding) & (height <= solid.reach)
-        covered = beside | (sees & solid.is_covered(k, first, normal))
+        ridge = joins & node.ridge
+        covered = beside | ridge | (sees & solid.is_covered(k, node))
         sees = sees | beside
         if _may_be(covered):
             ways = [way[::-1] for way in itertools.product((0.0, 1.0, -1.0), repeat=x.shape[1]) if any(way)]
             columns = [torch.stack([x.new_full((), step) for step in way]).expand_as(x) for way in ways]
             turned = [obstacle.turned(way, solid.scene, solid.time) for way in columns]
             neighbours = [x + solid.reach * way for way in turned]
-            for at, (above, toward) in zip(neighbours, _surfaces(solid, obstacle, neighbours), strict=True):
+            surfaces = _surfaces(solid, obstacle, neighbours)
+            on_faces = _are_on_faces(solid, obstacle, neighbours, surfaces)
+            for at, (above, toward), on_face in zip(neighbours, surfaces, on_faces, strict=True):
                 planes.append((at, above, toward))
-                wanted.append(covered & (above >= 0))
+                wanted.append(covered & (above >= 0) & on_face)
     # At an edge the normal is not defined, and distances rise more slowly along it.
     is_a_face = obstacle.signed_distance(first + solid.seam * normal, solid.scene, solid.time) > 0.8 * solid.seam
     for flat, own in ((False, ~joins), (True, joins & is_a_face)):
@@ -483,6 +484,36 @@ def _leaning(axis: Tensor) -> list[Tensor]:
     w = torch.stack([g, sign + y * y * f, -y], 1)
     turns = [(1.0, 0.0), (0.5, math.sqrt(0.75)), (-0.5, math.sqrt(0.75))]
     return [axis, *(half * axis + turn * (c * u + s * w) for turn in (root, -root) for c, s in turns)]
+
+
+class _Nearest(NamedTuple):
+    """The surface that a shape known by its distance alone has next to each node.
+
+    Attributes:
+        height, normal: distance of the node [n] [m], and the normal there [n, D].
+        first: the nearest point by these [n, D].
+        start: distance of that [n] [m]. It is not zero where the distance is inexact or has a ridge.
+        ridge: whether the node may be equally deep below several faces, one of which another obstacle or a wall may
+            cover, bool [n].
+        slack: how far its distances are from exact ones at a ridge [m]. Samples round it by a quarter of their spacing.
+    """
+
+    height: Tensor
+    normal: Tensor
+    first: Tensor
+    start: Tensor
+    ridge: Tensor
+    slack: Tensor
+
+
+def _nearest(solid: SolidNodes, k: int, x: Tensor, distance: Tensor) -> _Nearest:
+    obstacle = solid.obstacles[k]
+    height, normal = obstacle.surface_at(x, solid.scene, solid.time)
+    first = x - height[:, None] * normal
+    start = obstacle.signed_distance(first, solid.scene, solid.time)
+    slack = 0.5 * solid.seam + (0.25 * obstacle.shape.spacing if isinstance(obstacle.shape, Sampled) else 0)
+    own = torch.full(x.shape[:1], k, device=x.device)
+    return _Nearest(height, normal, first, start, (start < -slack) & _has_others(solid, x, distance, own), slack)
 
 
 # ---- feet
@@ -547,22 +578,26 @@ def _needs_search(solid: SolidNodes, x: Tensor, distance: Tensor, around: Tensor
         joins = torch.ones_like(rows, dtype=torch.bool)
         if not _has_faces(obstacle):
             part = solid.chosen(rows)
-            height, normal = obstacle.surface_at(x[rows], part.scene, solid.time)
-            first = x[rows] - height[:, None] * normal
+            node = _nearest(part, k, x[rows], distance[rows])
             away = _away(solid, obstacle)
-            joins = part.is_covered(k, first, normal) | ((normal * normal).sum(1) <= 0.5)
-            around_it = [first + away * lean for lean in _leaning(normal)]
+            joins = part.is_covered(k, node) | ((node.normal * node.normal).sum(1) <= 0.5)
+            around_it = [node.first + away * lean for lean in _leaning(node.normal)]
             for at, (above, toward) in zip(around_it, _surfaces(part, obstacle, around_it), strict=True):
-                joins = joins | (above < 0) | _join(solid, first, normal, at, above, toward)
+                joins = joins | (above < 0) | _join(solid, node, at, above, toward)
         near[rows] = joins
     return near
 
 
-def _join(solid: SolidNodes, first: Tensor, normal: Tensor, at: Tensor, above: Tensor, toward: Tensor) -> Tensor:
+def _join(solid: SolidNodes, node: _Nearest, at: Tensor, above: Tensor, toward: Tensor) -> Tensor:
     """Whether the plane that points `at` see differs from that of the nearest point of the surface, and goes through
-    that or behind it, as where faces join at an inner edge; it is before a rounded body. Bool [n]."""
-    height = above + (toward * (first - at)).sum(1)
-    return ((toward * normal).sum(1) < SAME) & (height >= -0.5 * solid.seam)
+    that or behind it, as where faces join at an inner edge; it is before a rounded body. Bool [n].
+
+    A node that is equally deep below several faces has a normal between theirs, and the point is still inside. There
+    the planes join that are no deeper than the node."""
+    height, cosine = above + (toward * (node.first - at)).sum(1), (toward * node.normal).sum(1)
+    ridge = node.height * (1 - cosine) - node.slack
+    lowest = torch.where(node.ridge, ridge, -0.5 * solid.seam)
+    return (cosine < SAME) & (height >= lowest)
 
 
 def _away(solid: SolidNodes, obstacle: Obstacle) -> Tensor:
@@ -577,6 +612,20 @@ def _surfaces(solid: SolidNodes, obstacle: Obstacle, points: Sequence[Tensor]) -
     scene = None if solid.scene is None else solid.scene.repeat(count)
     height, normal = obstacle.surface_at(torch.cat(list(points)), scene, solid.time)
     return list(zip(height.chunk(count), normal.chunk(count), strict=True))
+
+
+def _are_on_faces(
+    solid: SolidNodes, obstacle: Obstacle, points: Sequence[Tensor], seen: Sequence[tuple[Tensor, Tensor]]
+) -> list[Tensor]:
+    """Whether the nearest points of the surface to several points [N, D] of each node, by their distance and normal,
+    are on faces [N]: a step against the normal of an outer edge is less deep than it is long."""
+    step, shape = solid.seam, obstacle.shape
+    if isinstance(shape, Sampled):  # which rounds edges
+        step = step.clamp_min(shape.spacing)
+    below = [at - (above + step)[:, None] * toward for at, (above, toward) in zip(points, seen, strict=True)]
+    scene = None if solid.scene is None else solid.scene.repeat(len(points))
+    distance = obstacle.signed_distance(torch.cat(below), scene, solid.time)
+    return list((distance <= -SAME * step).chunk(len(points)))
 
 
 def _has_others(solid: SolidNodes, x: Tensor, distance: Tensor, around: Tensor) -> Tensor:
