@@ -1,4 +1,4 @@
-"""Graphs that are recorded, dropped or fail: streams, allocator and memory are left as they were."""
+"""Graphs that are captured, dropped or fail: streams, allocator and memory are left as they were."""
 
 import contextlib
 import os
@@ -43,7 +43,7 @@ def blob() -> tuple[mpm.Step, mpm.State]:
     return mpm.Step(grid, mpm.NeoHookean(E=1e4, nu=0.3)), state
 
 
-# A step that waits for the device in its last call alone, which is the recorded one. In processes of their own: torch
+# A step that waits for the device in its last call alone, which is the captured one. In processes of their own: torch
 # 2.11 leaves its random numbers in a capture whose end failed.
 FAILURE = """
 import torch
@@ -108,7 +108,7 @@ def test_dropped_graphs_leave_their_memory_to_the_next_ones(graph):
 
 @pytest.mark.cuda
 def test_memory_of_graphs_that_await_their_backward_pass_is_not_given_away():
-    """The step is gone when its gradient is taken, and another one has been recorded since."""
+    """The step is gone when its gradient is taken, and another one has been captured since."""
 
     def end(graph: int | None, start: torch.Tensor) -> torch.Tensor:
         step, state = blob()

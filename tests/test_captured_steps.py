@@ -17,7 +17,7 @@ from torch import nn
 
 import torch_mpm as mpm
 from benchmarks.catalogue.scenes import blob, unit_box
-from torch_mpm.cuda_graphs.capture import Recordings
+from torch_mpm.cuda_graphs.capture import CapturedGraphs
 from torch_mpm.rollouts import graph_segments
 from torch_mpm.step.status import uncounted
 
@@ -27,7 +27,7 @@ DT = 2e-4
 class Repeated(graph_segments.Graphs):
     """Imitation of a replay: arguments and results have fixed memory, and a backward pass overwrites its inputs."""
 
-    def record(self, beside):
+    def capture(self, beside):
         with uncounted(self._steps.step), torch.random.fork_rng([]):
             ends = self._steps(*self.read)
         self.follows = [t.requires_grad for t in ends]
@@ -57,14 +57,14 @@ class Repeated(graph_segments.Graphs):
 
 
 @pytest.fixture
-def recorded(device, monkeypatch):
-    """The recordings that are made from here on."""
+def captured(device, monkeypatch):
+    """The graphs that are captured from here on."""
     made = []
     base = graph_segments.Graphs if device == "cuda" else Repeated
 
     class Counted(base):
-        def record(self, beside):
-            super().record(beside)
+        def capture(self, beside):
+            super().capture(beside)
             made.append(self)
 
     monkeypatch.setattr(graph_segments, "Graphs", Counted)
@@ -193,7 +193,7 @@ def in_graphs_of(graph, **options):
 
 
 @pytest.mark.parametrize("make", MAKERS)
-def test_values_and_gradients_are_those_of_single_steps(make, device, recorded):
+def test_values_and_gradients_are_those_of_single_steps(make, device, captured):
     """Three segments and a remainder, in a loop that changes state and parameters; the status counts each step once."""
     step, state = make(device)
     again = make(device)[0]
@@ -205,18 +205,18 @@ def test_values_and_gradients_are_those_of_single_steps(make, device, recorded):
                 for p in (t for t in (*s.parameters(), *s.buffers()) if t.requires_grad):
                     p.mul_(0.9)
         assert int(step.status[0, 5]) == int(again.status[0, 5]) == 11 * (k + 1)
-    assert len(recorded) == 2
+    assert len(captured) == 2
     with torch.no_grad():
         assert_equal(mpm.rollout(step, state, 7, DT, graph=3), one_by_one(again, state, 7, DT))
     if make is not warm:  # which has no function of the user's
-        assert len(recorded) == 4
+        assert len(captured) == 4
     step.check()
     assert str(step.failures().problems) == str(again.failures().problems)
 
 
 @pytest.mark.parametrize("wanted", [True, False])
-def test_assigned_poses(wanted, device, recorded):
-    """Obstacles move to them as in single steps, with gradients by poses; these need no other recording."""
+def test_assigned_poses(wanted, device, captured):
+    """Obstacles move to them as in single steps, with gradients by poses; these need no other capture."""
     home = torch.tensor([0.5, 0.2], dtype=F64, device=device)
     ball = mpm.Sphere(home, 0.15, "sticky")
     step = mpm.Step(unit_box(2, deterministic=True), network(2, device), boundaries=[ball]).to(device)
@@ -233,7 +233,7 @@ def test_assigned_poses(wanted, device, recorded):
             torch.testing.assert_close(ball.pose_in(end).centre, ball.position.detach())
             found.append((end.detach(), grads))
         assert_alike(*found)
-    assert len(recorded) == (1 if wanted else 3)
+    assert len(captured) == (1 if wanted else 3)
 
 
 def slowed(state, k):
@@ -243,25 +243,25 @@ def slowed(state, k):
 @pytest.mark.parametrize(
     "options", [{"checkpoint": 5}, {"checkpoint": mpm.Checkpoints(states=3)}, {"every": 4, "hook": slowed}]
 )
-def test_with_checkpoints_and_hooks(options, device, recorded):
+def test_with_checkpoints_and_hooks(options, device, captured):
     step, state = learned(device)
     again = learned(device)[0]
     take = lambda step, state, n, dt: mpm.rollout(step, state, n, dt, **options)  # noqa: E731
     assert_alike(trained(step, state, 13, in_graphs_of(2, **options)), trained(again, state, 13, take))
-    assert recorded
+    assert captured
     assert int(step.status[0, 5]) == int(again.status[0, 5]) == 13
 
 
-def test_frames_pass_it_on(device, recorded):
+def test_frames_pass_it_on(device, captured):
     step, state = learned(device)
     with torch.no_grad():
         found = mpm.frames(step, state, 6, DT, every=2, graph=2)
         expected = mpm.frames(learned(device)[0], state, 6, DT, every=2)
-    assert len(recorded) == 1
+    assert len(captured) == 1
     assert float((found.fields["x"] - expected.fields["x"]).abs().max()) < 1e-14
 
 
-def test_random_numbers_are_those_of_the_first_time(device, recorded):
+def test_random_numbers_are_those_of_the_first_time(device, captured):
     """Dropout falls on the same particles in the backward pass, and the generator is left where steps from Python leave
     it."""
     found = []
@@ -274,7 +274,7 @@ def test_random_numbers_are_those_of_the_first_time(device, recorded):
     assert torch.equal(found[0][2], found[1][2])
 
 
-def test_a_backward_pass_after_other_calls(device, recorded):
+def test_a_backward_pass_after_other_calls(device, captured):
     """Graphs contain another state, and other particles, by then."""
     step, state = learned(device)
     starts = [state.replace(v=(k * state.v).requires_grad_()) for k in (1.0, 3.0)]
@@ -291,19 +291,19 @@ def test_a_backward_pass_after_other_calls(device, recorded):
 def test_on_the_cpu_steps_are_taken_as_without():
     step, state = learned("cpu")
     assert_alike(trained(step, state, 5, in_graphs_of(2)), trained(step, state, 5, one_by_one), 1e-14)
-    assert "_recordings" not in vars(step)
+    assert "_captured_graphs" not in vars(step)
     assert step.explain(state, DT).startswith("step by step, because")
     with pytest.raises(ValueError, match="graph must be at least 1"):
         mpm.rollout(step, state, 5, DT, graph=0)
 
 
-# ---- what is recorded, and when
+# ---- what is captured, and when
 
 
-def test_another_kind_is_recorded(device, recorded):
+def test_another_kind_is_captured(device, captured):
     step, state = learned(device)
     advance = mpm.make_graphed_step(step, None, DT, 2)
-    assert not recorded
+    assert not captured
     made = 0
 
     def check(state, new):
@@ -312,7 +312,7 @@ def test_another_kind_is_recorded(device, recorded):
             trained(step, state, 2, lambda s, state, n, dt: advance(state)), trained(step, state, 2, one_by_one)
         )
         made += new
-        assert len(recorded) == made
+        assert len(captured) == made
 
     check(state, 1)
     check(state.replace(x=state.x + 0.01), 0)
@@ -337,29 +337,29 @@ def test_another_kind_is_recorded(device, recorded):
     check(state, 1)
 
 
-def test_the_latest_recordings_are_kept(device, recorded):
+def test_the_latest_captured_graphs_are_kept(device, captured):
     step, _ = learned(device)
     advance = mpm.make_graphed_step(step, None, DT)
-    states = [blob(device, 2, 20 + k) for k in range(Recordings.most + 1)]
+    states = [blob(device, 2, 20 + k) for k in range(CapturedGraphs.most + 1)]
     with torch.no_grad():
         for state in (*states, states[-1], states[1], states[0]):
             advance(state)
-        assert len(recorded) == len(states) + 1
+        assert len(captured) == len(states) + 1
         assert_equal(advance(states[0]), one_by_one(step, states[0], 1, DT))
 
 
-def test_a_copy_of_a_step_begins_without(device, recorded):
+def test_a_copy_of_a_step_begins_without(device, captured):
     step, state = blown(device)
     with torch.no_grad():
         expected = mpm.rollout(step, state, 4, DT, graph=2)
         for other in (copy.deepcopy(step), pickle.loads(pickle.dumps(step))):
-            before = len(recorded)
+            before = len(captured)
             assert_equal(mpm.rollout(other, state, 4, DT, graph=2), expected)
-            assert len(recorded) == before + 1
+            assert len(captured) == before + 1
     assert step.explain(state, DT)
 
 
-def test_materials_and_order_by_content(device, recorded):
+def test_materials_and_order_by_content(device, captured):
     """Where steps keep indices that follow from them: other tensors of the same content are no other kind."""
     step, state = mixed(device)
     again = mixed(device)[0]
@@ -369,7 +369,7 @@ def test_materials_and_order_by_content(device, recorded):
             given = state.replace(material=material)
             end = mpm.rollout(step, given, 4, DT, graph=2)
             assert_equal(end, one_by_one(again, given, 4, DT))
-            assert len(recorded) == made and end.material is material
+            assert len(captured) == made and end.material is material
     stiff = torch.linspace(1e3, 1e4, 300, dtype=F64, device=device)
     step, again = (
         mpm.Step(unit_box(2, deterministic=True), mpm.NeoHookean(E=stiff, nu=0.3), on_grid=lambda b, v, m, dt: 0.99 * v)
@@ -386,7 +386,7 @@ def test_materials_and_order_by_content(device, recorded):
         assert_equal(mpm.rollout(step, given, 4, DT, graph=2), one_by_one(again, given, 4, DT))
 
 
-def test_states_are_not_kept(device, recorded):
+def test_states_are_not_kept(device, captured):
     """Neither states nor their history are stored, as after the first rollout of a long training."""
     step, state = learned(device)
     v = state.v.clone().requires_grad_()
@@ -396,16 +396,16 @@ def test_states_are_not_kept(device, recorded):
     kept = [weakref.ref(t) for t in (v, middle.x, middle.F, end.x)]
     del v, middle, end
     gc.collect()
-    assert recorded and not any(ref() is not None for ref in kept)
+    assert captured and not any(ref() is not None for ref in kept)
 
 
-def test_graphs_go_with_their_step(device, recorded):
+def test_graphs_go_with_their_step(device, captured):
     """At once: a loop over steps must not keep the memory of their graphs until the garbage collector runs."""
     step, state = blown(device)
     with torch.no_grad():
         mpm.rollout(step, state, 4, DT, graph=2)
-    kept = [weakref.ref(graphs) for graphs in recorded]
-    recorded.clear()
+    kept = [weakref.ref(graphs) for graphs in captured]
+    captured.clear()
     gc.collect()
     gc.disable()
     try:
@@ -415,7 +415,7 @@ def test_graphs_go_with_their_step(device, recorded):
         gc.enable()
 
 
-def test_under_autocast_and_without_gradients_for_good(device, recorded):
+def test_under_autocast_and_without_gradients_for_good(device, captured):
     """Separate graphs: half precision is that of the call, and tensors of inference mode stay in inference mode."""
     step, state = mixed(device)
     step, state = step.float(), state.to(dtype=torch.float32)
@@ -425,7 +425,7 @@ def test_under_autocast_and_without_gradients_for_good(device, recorded):
     plain, expected_plain = (trained(s, state, 4, take) for s, take in ((step, in_graphs_of(2)), (again, one_by_one)))
     with torch.autocast(device, torch.bfloat16):
         half, expected = (trained(s, state, 4, take) for s, take in ((step, in_graphs_of(2)), (again, one_by_one)))
-    assert len(recorded) == 3
+    assert len(captured) == 3
     # With casts of weights that are kept, autograd sums up gradients of the steps in half precision.
     for found, reference, tolerance in ((plain, expected_plain, 1e-5), (half, expected, 1e-2)):
         error = float((found[0].v - reference[0].v).abs().max())
@@ -434,7 +434,7 @@ def test_under_autocast_and_without_gradients_for_good(device, recorded):
             assert float((grad - expected_grad).abs().max()) < tolerance * float(expected_grad.abs().max())
 
 
-def test_the_pool_follows_the_scene(device, recorded):
+def test_the_pool_follows_the_scene(device, captured):
     """Matter that flies apart wants more blocks than it began with, in a training loop too."""
     found = []
     for take in (in_graphs_of(8), one_by_one):
@@ -447,7 +447,7 @@ def test_the_pool_follows_the_scene(device, recorded):
         step.check()
         assert step.grid.max_blocks > before
     assert_alike(*found, tolerance=1e-9)
-    assert len(recorded) > 1
+    assert len(captured) > 1
 
 
 class OwnStep(mpm.Step):
@@ -481,7 +481,7 @@ ASSIGNED = {
 
 
 @pytest.mark.parametrize("what", ASSIGNED)
-def test_what_is_assigned_is_recorded_anew(what, device, recorded):
+def test_what_is_assigned_is_captured_anew(what, device, captured):
     """Attributes of subclasses too, of objects that the step stores, and tensors of the user."""
 
     def make():
@@ -498,7 +498,7 @@ def test_what_is_assigned_is_recorded_anew(what, device, recorded):
         for one in (step, again):
             ASSIGNED[what](one)
         end, expected = mpm.rollout(step, state, 4, DT, graph=2), one_by_one(again, state, 4, DT)
-    assert len(recorded) == 2
+    assert len(captured) == 2
     assert_equal(end, expected)
     assert float((expected.v - before.v).abs().max()) > 1e-4
 
@@ -518,7 +518,7 @@ class Twice(nn.Module):
 
 
 @pytest.mark.parametrize("starts_over", [False, True])
-def test_a_module_of_the_users_says_what_time_it_is(device, recorded, starts_over):
+def test_a_module_of_the_users_says_what_time_it_is(device, captured, starts_over):
     """And may drop a history; what it writes to buffers are its calls alone."""
     module, again = (Twice(blown(device)[0], starts_over).to(device) for _ in range(2))
     state = blob(device, 2).replace(extra={"mark": torch.ones(300, dtype=F64, device=device)})
@@ -530,7 +530,7 @@ def test_a_module_of_the_users_says_what_time_it_is(device, recorded, starts_ove
     assert_equal(end.replace(time=0.0), expected.replace(time=0.0))
 
 
-def test_a_step_that_was_moved_is_recorded(device, recorded):
+def test_a_step_that_was_moved_is_captured(device, captured):
     """After steps on the CPU."""
     step, state = blown("cpu")
     with torch.no_grad():
@@ -543,7 +543,7 @@ def test_a_step_that_was_moved_is_recorded(device, recorded):
 # ---- what does not go into a graph
 
 
-def test_hooks_and_tensors_elsewhere_are_refused(device, recorded):
+def test_hooks_and_tensors_elsewhere_are_refused(device, captured):
     step, state = blown(device)
     advance = mpm.make_graphed_step(step, state, DT, n=2)
     hook = step.law.register_forward_hook(lambda module, args, result: None)
@@ -558,7 +558,7 @@ def test_hooks_and_tensors_elsewhere_are_refused(device, recorded):
         assert "a tensor of it is on meta" in step.explain(state, DT)
 
 
-def test_gradients_that_would_be_lost_are_refused(device, recorded):
+def test_gradients_that_would_be_lost_are_refused(device, captured):
     weight = torch.ones((), dtype=F64, device=device, requires_grad=True)
     state = blob(device, 2)
     for used in (weight, 2 * weight):
@@ -569,7 +569,7 @@ def test_gradients_that_would_be_lost_are_refused(device, recorded):
             mpm.rollout(step, state, 4, DT, graph=2)
 
 
-def test_what_is_wrong(device, recorded):
+def test_what_is_wrong(device, captured):
     step, state = learned(device)
     with pytest.raises(TypeError, match="step must be a Step or another module"):
         mpm.make_graphed_step(lambda state, dt: state, state, DT)
@@ -585,7 +585,7 @@ def test_what_is_wrong(device, recorded):
 
 
 @pytest.mark.filterwarnings("ignore:Anomaly Detection")
-def test_obstacles(device, recorded):
+def test_obstacles(device, captured):
     step, state = learned(device)
 
     def why(step, state, dt):
@@ -605,7 +605,7 @@ def test_obstacles(device, recorded):
     assert why(step, state, DT) == "there are hooks"
     with torch.no_grad():  # and such steps are taken all the same
         assert_equal(mpm.rollout(step, state, 3, DT, graph=2), one_by_one(learned(device)[0], state, 3, DT))
-    assert not recorded
+    assert not captured
     if device == "cuda":
         assert "not graph: there are hooks" in step.explain(state, DT)
         assert "rollout(graph=...) launches some" in learned(device)[0].explain(state, DT)

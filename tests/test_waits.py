@@ -50,7 +50,7 @@ def test_a_rollout_returns_before_a_gpu_begins(kind, gradient, device):
             if gradient:
                 torch.autograd.grad(end.x.sum(), state.v)
 
-    for _ in range(2):  # pools of blocks and of memory are made
+    for _ in range(2):  # the pool of blocks and the memory of graphs are made
         call()
         torch.cuda.synchronize()
     torch.cuda._sleep(CYCLES)

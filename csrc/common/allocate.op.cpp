@@ -3,15 +3,15 @@
 #include "common/backend.h"
 
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
+#include "cpu/memory_cache.h"
 #include "cpu/parallel.h"
-#include "cpu/pool.h"
 #endif
 
 namespace mpm {
 namespace {
 
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
-// Bytes of an element of a type that the pool supports, otherwise 0.
+// Bytes of an element of a type that the memory cache supports, otherwise 0.
 int64_t element_size(ScalarType type) {
   switch (type) {
     case ScalarType::Double:
@@ -33,15 +33,15 @@ int64_t element_size(ScalarType type) {
   }
 }
 
-// Tensor in memory of the pool; undefined where the tensor is small or the pool has no memory.
-Tensor empty_in_pool(const Tensor& like, const Shape& shape, const Shape& strides, ScalarType type) {
+// Tensor in memory of the cache; undefined where the tensor is small or the system has no memory.
+Tensor empty_from_cache(const Tensor& like, const Shape& shape, const Shape& strides, ScalarType type) {
   int64_t last = 0;
   for (size_t i = 0; i < shape.size(); i++) {
     if (shape[i] == 0) return {};
     last += (shape[i] - 1) * strides[i];
   }
   const int64_t bytes = (last + 1) * element_size(type);  // zero for other types
-  cpu::Buffer* buffer = bytes < cpu::kPooled ? nullptr : cpu::take(bytes);
+  cpu::Buffer* buffer = bytes < cpu::kLeastCached ? nullptr : cpu::take(bytes);
   if (!buffer) return {};
   return torch::stable::from_blob(buffer->data, shape, strides, like.device(), type,
                                   [buffer](void*) { cpu::give_back(buffer); });
@@ -66,7 +66,7 @@ void check_allocatable(const Shape& shape) {
 
 Tensor empty_strided(const Tensor& like, const Shape& shape, const Shape& strides, ScalarType type) {
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
-  if (Tensor pooled = empty_in_pool(like, shape, strides, type); pooled.defined()) return pooled;
+  if (Tensor cached = empty_from_cache(like, shape, strides, type); cached.defined()) return cached;
 #endif
   AtenTensorHandle handle;
   int32_t device;

@@ -132,7 +132,8 @@ NodeField<const T> node_input(const Tensor& t, const char* name, const Tensor& x
   return {static_cast<const T*>(t.data_ptr()), t.stride(0), int(t.size(1))};
 }
 
-// Uninitialised tensors on the device of another one; on the CPU, large ones come from a pool (csrc/cpu/pool.h).
+// Uninitialised tensors on the device of another one; on the CPU, large ones come from a cache
+// (csrc/cpu/memory_cache.h).
 Tensor empty_strided(const Tensor& like, const Shape& shape, const Shape& strides, ScalarType type);
 Tensor empty(const Tensor& like, const Shape& shape, ScalarType type);
 Tensor empty(const Tensor& like, const Shape& shape);

@@ -123,10 +123,10 @@ void iterate(ConjugateGradientsArguments<T, D>& a, [[maybe_unused]] const Tensor
              const Iteration& iteration) {
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda && CUDART_VERSION >= 13000
   if (a.max_iterations == 0 || a.max_blocks == 0 || a.scenes == 0) return;
-  const auto once = [&](cudaStream_t recorded, unsigned long long condition) {
-    iteration(recorded);
+  const auto once = [&](cudaStream_t captured, unsigned long long condition) {
+    iteration(captured);
     a.loop = condition;
-    backend::cg_look(a, recorded);
+    backend::cg_look(a, captured);
   };
   repeat(stream, once, [&] {
     for (const ConjugateGradients& scene : on_host(a.scene, a.scenes, stream))

@@ -8,7 +8,7 @@ inline namespace TORCH_MPM_ISA {
 template <class Law>
 struct FibreKernels;
 
-// Fibres with a direction d at rest and an activation a, added to a law of the surrounding solid:
+// Fibres with a direction d at rest and an active stress a, added to a law of the surrounding solid:
 //   ψ = a/2 (|F d|² − 1),   τ = a (F d) (F d)ᵀ,
 // the actuation F A Fᵀ of ChainQueen (Hu et al. 2019) with A = a d dᵀ. In 2-D the last entry of d has no meaning.
 struct Fibre : InvariantLaw {
@@ -25,33 +25,33 @@ struct Fibre : InvariantLaw {
 template <class S, int D>
 struct FibreState {
   Matrix<S, D> F;
-  S activation;
+  S active_stress;
   Vector<S, D> direction;
 
   MPM_HD Vector<S, D> stretched() const { return F * direction; }
   MPM_HD Matrix<S, D> stress() const {
     const Vector<S, D> f = stretched();
-    return outer(activation * f, f);
+    return outer(active_stress * f, f);
   }
   MPM_HD S energy() const {
     const Vector<S, D> f = stretched();
-    return S(0.5) * activation * (dot(f, f) - S(1));
+    return S(0.5) * active_stress * (dot(f, f) - S(1));
   }
 
   // Of τ̄ : τ.
   MPM_HD FibreState stress_adjoint(const Matrix<S, D>& grad) const {
     const Vector<S, D> f = stretched(), twice = grad * f + transpose(grad) * f;
-    return by_stretched(S(0.5) * dot(f, twice), activation * twice);
+    return by_stretched(S(0.5) * dot(f, twice), active_stress * twice);
   }
   // Of ψ̄ ψ.
   MPM_HD FibreState energy_adjoint(const S& grad) const {
     const Vector<S, D> f = stretched();
-    return by_stretched(S(0.5) * grad * (dot(f, f) - S(1)), (grad * activation) * f);
+    return by_stretched(S(0.5) * grad * (dot(f, f) - S(1)), (grad * active_stress) * f);
   }
 
  private:
-  MPM_HD FibreState by_stretched(const S& by_activation, const Vector<S, D>& by_f) const {
-    return {outer(by_f, direction), by_activation, transpose(F) * by_f};
+  MPM_HD FibreState by_stretched(const S& by_active_stress, const Vector<S, D>& by_f) const {
+    return {outer(by_f, direction), by_active_stress, transpose(F) * by_f};
   }
 };
 
@@ -68,13 +68,13 @@ struct FibreKernels {
   MPM_HD static FibreState<V, D> load_as(const At& at, const LawArguments<T, D>& a) {
     FibreState<V, D> s;
     s.F = convert<V>(load_matrix<D>(at, a.state));
-    s.activation = convert<V>(load_parameter(at, a, 0));
+    s.active_stress = convert<V>(load_parameter(at, a, 0));
     MPM_UNROLL for (int i = 0; i < D; i++)
       s.direction[i] = convert<V>(load_parameter(at, a, 1 + i));
     return s;
   }
 
-  // Whether the solid has a valid stress. An activation that is not finite is not hidden.
+  // Whether the solid has a valid stress. An active stress that is not finite is not hidden.
   template <class V, int D>
   MPM_HD static MaskOf<V> is_valid_at(const FibreState<V, D>& s) {
     const V J = determinant(s.F);
@@ -91,7 +91,7 @@ struct FibreKernels {
     const Matrix<V, D> along = load_matrix_or_zero<D>(at, along_state);
     const auto entry = [&](int k) { return along_parameters.pointer ? load_entry(at, along_parameters, k) : V(0); };
     FibreState<Dual<V>, D> z;
-    z.activation = {s.activation, entry(0)};
+    z.active_stress = {s.active_stress, entry(0)};
     MPM_UNROLL for (int i = 0; i < D; i++) {
       z.direction[i] = {s.direction[i], entry(1 + i)};
       MPM_UNROLL for (int j = 0; j < D; j++)
@@ -105,7 +105,7 @@ struct FibreKernels {
                            const Field<T>& parameters) {
     if (state.pointer) store_matrix<D>(at, state, or_zero(valid, g.F));
     if (!parameters.pointer) return;
-    store_entry(at, parameters, 0, select(valid, g.activation, V(0)));
+    store_entry(at, parameters, 0, select(valid, g.active_stress, V(0)));
     MPM_UNROLL for (int i = 0; i < 3; i++)
       store_entry(at, parameters, 1 + i, i < D ? select(valid, g.direction[i < D ? i : 0], V(0)) : V(0));
   }
@@ -113,7 +113,7 @@ struct FibreKernels {
   template <class V, int D>
   MPM_HD static FibreState<V, D> derivative(const FibreState<Dual<V>, D>& z) {
     FibreState<V, D> g;
-    g.activation = z.activation.derivative;
+    g.active_stress = z.active_stress.derivative;
     MPM_UNROLL for (int i = 0; i < D; i++) {
       g.direction[i] = z.direction[i].derivative;
       MPM_UNROLL for (int j = 0; j < D; j++)
@@ -169,7 +169,8 @@ struct FibreKernels {
       return at.store(a.value.pointer, a.value.stride[0], select(valid, energy, V(INFINITY)));
     }
     const Vector<V, D> f = s.stretched();
-    const V modulus = abs(s.activation) * dot(f, f), value = a.which == LawScalar::stiffness ? V(2) * modulus : modulus;
+    const V modulus = abs(s.active_stress) * dot(f, f),
+            value = a.which == LawScalar::stiffness ? V(2) * modulus : modulus;
     at.store(a.value.pointer, a.value.stride[0], select(valid, value, V(0)));
   }
 

@@ -37,7 +37,7 @@ namespace mpm {
   BOOL(one_deformation)    /* either F or J moves, not both */                               \
   BOOL(gradients)          /* are wanted */                                                  \
   BOOL(records)            /* what gradients need is stored */                               \
-  BOOL(captured)           /* the stream is recorded into a CUDA graph */                    \
+  BOOL(captured)           /* the stream is captured into a CUDA graph */                    \
   BOOL(graph_loops)        /* the device runs CUDA graphs with loops: CUDA 13, and no MPS */ \
   INT(path_bytes)          /* of the table of obstacles on paths, of one substep */
 
@@ -218,7 +218,7 @@ inline std::string unsupported(const PlanFacts& f) {
   if (f.particles > kMostPersistentParticles)
     return "there are more than " + count(kMostPersistentParticles, "particles");
   if (f.steps < kLeastPersistentSteps) return "a call has fewer than " + count(kLeastPersistentSteps, "steps");
-  if (f.captured) return "the stream is recorded into a CUDA graph";
+  if (f.captured) return "the stream is captured into a CUDA graph";
   if (!f.graph_loops) return "the device runs no CUDA graphs with loops";
   return {};
 }

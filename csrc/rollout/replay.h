@@ -34,18 +34,19 @@ void with_team(int64_t, const Work& work) {
   work();
 }
 
-// Records the graphs of a thread, and stores the latest one. The next graph mostly differs in its pointers only, and an
-// update of these takes a third of the time of a new graph. It has a separate stream, since torch's default stream
+// Captures the graphs of a thread, and stores the latest one. The next graph mostly differs in its pointers only, and
+// an update of these takes a third of the time of a new graph. It has a separate stream, since torch's default stream
 // cannot be captured.
-class Recorder {
+class CapturedGraph {
  public:
-  static Recorder& of_this_thread() {
-    static thread_local Recorder* const recorder = new Recorder;  // never destroyed: CUDA may be unloaded before
-    return *recorder;
+  static CapturedGraph& of_this_thread() {
+    static thread_local CapturedGraph* const latest =
+        new CapturedGraph;  // never destroyed: CUDA may be unloaded before
+    return *latest;
   }
 
   template <class Work>
-  void record(const Work& work) {
+  void capture(const Work& work) {
     use_device();
     // Relaxed: concurrent work of other threads is not captured, and must not fail.
     check(cudaStreamBeginCapture(stream_, cudaStreamCaptureModeRelaxed));
@@ -148,7 +149,7 @@ class Recorder {
     constexpr size_t most = 32;
     static std::mutex mutex;
     static std::vector<cudaGraphExec_t>* const kept =
-        new std::vector<cudaGraphExec_t>;  // never destroyed, like the recorder
+        new std::vector<cudaGraphExec_t>;  // never destroyed, like the graphs of threads
     std::vector<cudaGraphExec_t> old;
     {
       const std::lock_guard<std::mutex> lock(mutex);
@@ -164,22 +165,22 @@ class Recorder {
   std::vector<int> shape_;
 };
 
-constexpr int64_t kLeastReplays = 6;  // least number for which a recording pays
+constexpr int64_t kLeastReplays = 6;  // least number for which a capture pays
 
-inline bool is_recorded(cudaStream_t stream) {
+inline bool is_captured(cudaStream_t stream) {
   cudaStreamCaptureStatus status = cudaStreamCaptureStatusActive;
   return cudaStreamIsCapturing(stream, &status) != cudaSuccess || status != cudaStreamCaptureStatusNone;
 }
 
-// Number of replays of `work(stream)`: `times`, or zero if a recording would not pay or the stream itself is captured.
+// Number of replays of `work(stream)`: `times`, or zero if a capture would not pay or the stream itself is captured.
 // The work must consist of kernels, copies and memsets only. `launched()` is called after each replay.
 template <class Work, class Launched>
 int64_t replay(int64_t times, cudaStream_t stream, const Work& work, const Launched& launched) {
-  if (times < kLeastReplays || is_recorded(stream)) return 0;
-  Recorder& recorder = Recorder::of_this_thread();
-  recorder.record(work);
+  if (times < kLeastReplays || is_captured(stream)) return 0;
+  CapturedGraph& graph = CapturedGraph::of_this_thread();
+  graph.capture(work);
   for (int64_t k = 0; k < times; k++) {
-    recorder.launch(stream);
+    graph.launch(stream);
     launched();
   }
   return times;
@@ -192,7 +193,7 @@ int64_t replay(int64_t times, cudaStream_t stream, const Work& work, const Launc
 template <class Work, class GoesOn>
 void repeat(cudaStream_t stream, const Work& work, const GoesOn& goes_on) {
   static const bool by_host = std::getenv("TORCH_MPM_HOST_LOOPS");
-  if (!by_host) return Recorder::of_this_thread().repeat(stream, work);
+  if (!by_host) return CapturedGraph::of_this_thread().repeat(stream, work);
   do work(stream, 0);
   while (goes_on());
 }

@@ -171,7 +171,7 @@ Results run(const SubstepsInputs& in) {
       time_ = copy_of(*in.scene_time);
       s.count_scene_times(time_);
     }
-    s.facts.captured = is_recorded(stream);
+    s.facts.captured = is_captured(stream);
     s.facts.graph_loops = !loops_are_refused;
     const Schedule schedule = schedule_of(in.schedule, s.facts);
     schedule_of_latest = schedule;

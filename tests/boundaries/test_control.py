@@ -666,7 +666,7 @@ def test_a_step_that_fails_inside_a_call_leaves_its_obstacles():
 
 
 def test_keys_of_steps_from_graphs_do_not_depend_on_calls():
-    """So that steps with an obstacle at rest are recorded once."""
+    """So that steps with an obstacle at rest are captured once."""
     step, state = step_with(box((0.35, 0.25))), block()
     keys = [StepKey(step).key]
     for _ in range(3):

@@ -36,7 +36,7 @@ def test_takes_as_indexing_does(index, particles, device):
 
 
 def test_takes_many(device):
-    """More than the pool of the CPU has small pieces of memory for."""
+    """More than the memory cache of the CPU has small pieces of memory for."""
     numbers = torch.arange(1_200_000, device=device)
     given = [
         numbers << 20,

@@ -163,7 +163,7 @@ def test_order_of_particles(changes, order):
         ("persistent", CPU, "the particles are on the CPU"),
         ("persistent", FEW._replace(steps=9), "fewer than 10 steps"),
         ("persistent", FEW._replace(particles=2**15 + 1), "more than 32768 particles"),
-        ("persistent", FEW._replace(captured=True), "recorded into a CUDA graph"),
+        ("persistent", FEW._replace(captured=True), "captured into a CUDA graph"),
         ("persistent", FEW._replace(graph_loops=False), "no CUDA graphs with loops"),
         ("fused_g2p2g", MANY._replace(scene_ids=True), "number of a scene"),
         ("fused_g2p2g", MANY._replace(gradients=True), "gradients are wanted"),

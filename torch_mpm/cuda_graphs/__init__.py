@@ -1,1 +1,1 @@
-"""CUDA graphs: capture, replay, keys of recordings and their memory."""
+"""CUDA graphs: capture, replay, keys of captured graphs and their memory."""

@@ -14,22 +14,22 @@ from torch import Tensor
 
 
 def is_captured(x: Tensor) -> bool:
-    """Whether operations on a tensor are recorded by a CUDA graph."""
+    """Whether operations on a tensor are captured in a CUDA graph."""
     return x.is_cuda and not torch.compiler.is_compiling() and torch.cuda.is_current_stream_capturing()
 
 
 @contextlib.contextmanager
-def capturing(graph: torch.cuda.CUDAGraph, pool: Any, device: torch.device) -> Iterator[None]:
-    """Capture the work of the current stream into a graph with memory from a pool; other threads continue.
+def capturing(graph: torch.cuda.CUDAGraph, memory: Any, device: torch.device) -> Iterator[None]:
+    """Capture the work of the current stream into a graph with given memory; other threads continue.
 
     Args:
         graph: an empty graph.
-        pool: the pool of another graph, or None for a new one.
+        memory: the memory of another graph, as `graph.pool()`, or None for new memory.
         device: device of the stream.
 
     A failed capture leaves the allocator unchanged.
     """
-    pool = torch.cuda.graph_pool_handle() if pool is None else pool
+    pool = torch.cuda.graph_pool_handle() if memory is None else memory
     try:
         graph.capture_begin(pool, capture_error_mode="thread_local")
         yield
@@ -218,12 +218,12 @@ class Same:
         return id(self._thing)
 
 
-class Recordings:
-    """Recorded CUDA graphs by key, with eviction of the least recently used. They share memory, so that each overwrites
-    the results of the others. Neither copied nor pickled: a copy of a step begins without recordings.
+class CapturedGraphs:
+    """Captured CUDA graphs by key, with eviction of the least recently used. They share memory, so that each overwrites
+    the results of the others. Neither copied nor pickled: a copy of a step begins without captured graphs.
 
     Attributes:
-        most: maximum number of recordings.
+        most: maximum number of keys.
         latest: mark of the call whose results are in the memory; None where they are overwritten.
         unseen: calls since the last query of the number of active blocks.
     """
@@ -253,26 +253,26 @@ class Recordings:
             self._done = torch.cuda.Event()
             self._done.record(stream)
 
-    def __reduce__(self) -> tuple[type[Recordings], tuple[()]]:
-        return Recordings, ()
+    def __reduce__(self) -> tuple[type[CapturedGraphs], tuple[()]]:
+        return CapturedGraphs, ()
 
     def __len__(self) -> int:
         return len(self._kept)
 
     def get(self, key: Hashable) -> Any:
-        """The recording of a key, or None."""
+        """The captured graphs of a key, or None."""
         if key in self._kept:
             self._kept.move_to_end(key)
         return self._kept.get(key)
 
-    def keep(self, key: Hashable, recording: Any) -> None:
-        self._kept[key] = recording
+    def keep(self, key: Hashable, captured: Any) -> None:
+        self._kept[key] = captured
         self._kept.move_to_end(key)
         if len(self._kept) > self.most:
             self._kept.popitem(last=False)
 
     def some(self) -> Any:
-        """One of the recordings, or None."""
+        """The captured graphs of one of the keys, or None."""
         return next(iter(self._kept.values()), None)
 
     def same_content(self, name: str, t: Tensor) -> Tensor:

@@ -57,10 +57,10 @@ class Replays:
         impulse = None if state.impulse is None else copied(state.impulse)
         self.state = self.state.replace(material=state.material, scene=state.scene, ids=state.ids, impulse=impulse)
         self._graph, self._memory = torch.cuda.CUDAGraph(), GraphMemory(state.x.device, waits=False)
-        with self._memory.recorded(self._graph):
-            self._record(function)
+        with self._memory.capturing(self._graph):
+            self._capture(function)
 
-    def _record(self, function: Callable[[State], State]) -> None:
+    def _capture(self, function: Callable[[State], State]) -> None:
         before, after = tensors_of(self.state), tensors_of(function(self.state))
         changed = [name for name, value in after.items() if value is not before[name]]
         copy_all([before[name] for name in changed], [after[name] for name in changed])

@@ -1,4 +1,4 @@
-"""Keys of CUDA graph recordings: the properties of a step that a recording depends on."""
+"""Keys of captured CUDA graphs: the properties of a step that its graphs depend on."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from .capture import NUMBERS, Same, is_of_library, version
 
 
 class StepKey:
-    """Properties of an unchanged step that a recording depends on.
+    """Properties of an unchanged step that its captured graphs depend on.
 
     Attributes:
         own: its tensors that require gradients, by "step." and their name.
-        key: other parts of the key of a recording.
+        key: other parts of the key of captured graphs.
         steps: the steps in it.
     """
 
@@ -41,7 +41,7 @@ class StepKey:
                 if t is not None:
                     named.setdefault(id(t), (f"step.{place}.{name}" if place else f"step.{name}", t))
         self.own = {name: t for name, t in named.values() if t.requires_grad}
-        # The key does not hold the step, which owns its recordings: a cycle would delay their release.
+        # The key does not hold the step, which owns its captured graphs: a cycle would delay their release.
         self.key = tuple(
             (None if m is step or type(m) is RigidMotion else Same(m), *content_of(m)) for m in modules.values()
         )
@@ -120,6 +120,6 @@ def autocast_of(device: torch.device) -> tuple[bool, torch.dtype]:
 
 
 def surroundings(device: torch.device) -> Hashable:
-    """Settings of torch that affect a recording."""
+    """Settings of torch that affect a capture."""
     precision = torch.get_float32_matmul_precision(), torch.are_deterministic_algorithms_enabled()
     return torch.is_grad_enabled(), autocast_of(device), precision

@@ -37,11 +37,11 @@ class GraphMemory:
     """Memory shared by graphs, reused from destroyed graphs if possible.
 
     The allocator does not free the memory of a destroyed graph for other processes until it runs short. Therefore the
-    last user of the memory stores one graph, and the next recording reuses its memory.
+    last user of the memory stores one graph, and the next capture reuses its memory.
 
     Args:
         device: the device.
-        waits: whether a recording waits for the device. Replays may then run on any stream; otherwise all run on the
+        waits: whether a capture waits for the device. Replays may then run on any stream; otherwise all run on the
             current one, in their order.
     """
 
@@ -60,12 +60,12 @@ class GraphMemory:
             weakref.finalize(self, self._unused.append, graph).atexit = False
 
     @contextlib.contextmanager
-    def recorded(self, graph: torch.cuda.CUDAGraph) -> Iterator[None]:
+    def capturing(self, graph: torch.cuda.CUDAGraph) -> Iterator[None]:
         """Context whose operations are captured in an empty graph with this memory."""
         if self._waits:
             torch.cuda.synchronize(self._device)
-        pool = None if self._owner is None else self._owner.pool()
-        with on_own_stream(self._device, self._replayed), capturing(graph, pool, self._device):
+        memory = None if self._owner is None else self._owner.pool()
+        with on_own_stream(self._device, self._replayed), capturing(graph, memory, self._device):
             yield
         self._own(graph)
 

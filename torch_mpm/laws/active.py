@@ -1,4 +1,4 @@
-"""Muscles: a material that contracts along fibres under an activation."""
+"""Muscles: a material that contracts along fibres, by an active stress."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Active"]
 
-ACTIVATION = "activation"
+ACTIVE_STRESS = "activation"
 """Key of `State.extra` with the active stress of each particle [P] [Pa]."""
 FIBRE = "fibre"
 """Name of the compiled law, csrc/laws/fibre.h."""
@@ -30,9 +30,9 @@ class Active(Material):
     That is the stress of the energy a (|F d|² − 1)/2 per rest volume, a spring along the fibre, for a constant a; the
     actuation F A Fᵀ of ChainQueen (Hu et al. 2019) with A = a d dᵀ.
 
-    The activation a [P] [Pa] is `state.extra["activation"]`, zero by default; a > 0 contracts. A controller sets it in
-    `Step(on_particles=)` for each step, or a hook of `rollout` every n steps; gradients pass to it. Steps between two
-    hooks are computed in one op where the law is compiled.
+    The muscle activation a [P] [Pa] is `state.extra["activation"]`, zero by default; a > 0 contracts. A controller sets
+    it in `Step(on_particles=)` for each step, or a hook of `rollout` every n steps; gradients pass to it. Steps between
+    two hooks are computed in one op where the law is compiled.
 
     Args:
         law: any law of F, also a function or module F -> Kirchhoff stress.
@@ -55,7 +55,7 @@ class Active(Material):
             direction = torch.tensor(check_vector("direction", direction), dtype=torch.float64, device="cpu")
         if direction.dim() not in (1, 2) or direction.shape[-1] not in (2, 3) or not direction.is_floating_point():
             raise ValueError(f"direction must be a floating tensor of shape [D] or [P, D], got {shape_of(direction)}")
-        self.state_fields, self.extra_fields = law.state_fields, (*law.extra_fields, ACTIVATION)
+        self.state_fields, self.extra_fields = law.state_fields, (*law.extra_fields, ACTIVE_STRESS)
         self.viscous = law.viscous
         if isinstance(direction, torch.nn.Parameter):
             self.direction = direction
@@ -80,7 +80,7 @@ class Active(Material):
             raise ValueError(f"direction must have shape [D] or [P, D] with P = {particles}, got {found}")
 
     def initial(self, name: str, state: State) -> Tensor:
-        return torch.zeros_like(state.mass) if name == ACTIVATION else self.law.initial(name, state)
+        return torch.zeros_like(state.mass) if name == ACTIVE_STRESS else self.law.initial(name, state)
 
     def energy_density(self, state: State) -> Tensor:
         return self.law.energy_density(state) + law_energy(*self._fibre(state))
@@ -98,23 +98,23 @@ class Active(Material):
         return self.law.invalid(state)
 
     def fibre_parameters(self, state: State) -> list[Tensor]:
-        """Parameters of the compiled law `FIBRE`: activation, and three entries of the direction, [] or [P]."""
+        """Parameters of the compiled law `FIBRE`: the active stress, and three entries of the direction, [] or [P]."""
         if self._everywhere and self.direction.device != state.x.device:
             self.direction = self.direction.to(state.x.device)
-        activation, x = self._activation(state), state.x
+        active_stress, x = self._active_stress(state), state.x
         direction = of_particles("direction", self.direction, state, tuple(x.shape)).to(x.dtype)
         entries = list(direction.unbind(-1))
-        return [activation, *entries, *(x.new_zeros(()) for _ in range(3 - len(entries)))]
+        return [active_stress, *entries, *(x.new_zeros(()) for _ in range(3 - len(entries)))]
 
     def _fibre(self, state: State) -> tuple[str, Tensor, list[Tensor]]:
         """Arguments of the ops of a law."""
         assert state.F is not None
         return FIBRE, state.F, self.fibre_parameters(state)
 
-    def _activation(self, state: State) -> Tensor:
-        if ACTIVATION not in state.extra:
+    def _active_stress(self, state: State) -> Tensor:
+        if ACTIVE_STRESS not in state.extra:
             return torch.zeros_like(state.mass)
-        a = state.extra[ACTIVATION]
+        a = state.extra[ACTIVE_STRESS]
         if a.shape != state.mass.shape or a.dtype != state.mass.dtype:
             kind = f"{str(state.mass.dtype).removeprefix('torch.')} [P] = [{len(state.mass)}]"
             raise ValueError(f"state.extra['activation'] must be {kind}, got {a.dtype} {shape_of(a)}")

@@ -146,7 +146,7 @@ def recomputed(advance: Advance, state: State, count: int, first: int, step: Any
             stack.enter_context(same_pools(pools))
             if again:  # Graphs write to the tensors that `aside` would replace.
                 stack.enter_context(motions())
-                from_graphs = isinstance(step, torch.nn.Module) and "_recordings" in vars(step)
+                from_graphs = isinstance(step, torch.nn.Module) and "_captured_graphs" in vars(step)
                 stack.enter_context(uncounted(step) if from_graphs else aside(step, given.x))
             again = True
             return advance(given, count, first)

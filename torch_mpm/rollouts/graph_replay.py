@@ -11,7 +11,7 @@ from ..step.step import Step
 from .steps import Steps
 
 LEAST_STEPS = 6
-"""Least number of replays for which a step is recorded: a recording takes the host as long as one or two steps."""
+"""Least number of replays for which a step is captured: a capture takes the host as long as one or two steps."""
 CHUNK = 64
 """Steps between two queries of the number of active blocks, for a pool that grows with the scene on CUDA."""
 

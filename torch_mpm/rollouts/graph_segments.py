@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from ..boundaries.control import control_step, steady
-from ..cuda_graphs.capture import Recordings, Same
+from ..cuda_graphs.capture import CapturedGraphs, Same
 from ..cuda_graphs.graph import WorkInFlight, copied, copy_all, time_tensor
 from ..cuda_graphs.keys import StepKey, autocast_of, surroundings
 from ..cuda_graphs.memory import GraphMemory, on_own_stream
@@ -27,7 +27,7 @@ from ..step.step import Step
 from .steps import Steps
 
 TRIALS = 3
-"""Number of times that steps are computed from Python before they are recorded, as torch does: compilers of user code
+"""Number of times that steps are computed from Python before they are captured, as torch does: compilers of user code
 trace or tune in the first ones."""
 
 
@@ -40,26 +40,26 @@ def make_graphed_step(step: nn.Module, state: State | None, dt: float, n: int = 
         for batch in data:
             loss(advance(batch)).backward()
 
-    A recording takes as long as a few rollouts of n steps, and the latest 8 are stored. A call records again after a
-    change of one of these:
+    A capture takes as long as a few rollouts of n steps. The graphs of the latest 8 captures are stored. A call
+    captures again after a change of one of these:
 
     - the fields of the state, their shapes and dtypes, and those that require gradients;
     - the grad mode or autocast;
     - the pool of a grid without `max_blocks`, if it grew;
     - assigned numbers, tensors and parts of the step. For example, a pose assigned to an obstacle between two calls
-      (see `Obstacle`) makes the next call record: give the obstacle a path instead, or call `rollout`.
+      (see `Obstacle`) makes the next call capture: give the obstacle a path instead, or call `rollout`.
 
-    Recordings share memory: as much as the largest one needs (with gradients, everything that autograd stores for n
-    steps), and for each one the state and parameters before and after the steps.
+    Captured graphs share memory: as much as the largest ones need (with gradients, everything that autograd stores for
+    n steps), and for each capture the state and parameters before and after the steps.
 
-    Parameters and buffers are read in each call. Code, and numbers in user modules, are those of the recording, which
+    Parameters and buffers are read in each call. Code, and numbers in user modules, are those of the capture, which
     calls the step a few times with `state.time` as a tensor. The graphs read and write the same memory in each call: a
     backward pass after another call recomputes its steps. `rollout(graph=n)` divides a rollout into such graphs.
 
     Args:
         step: a `Step`, or another module (state, dt) -> state; no hooks.
         state: a state like those to come, on a CUDA device. Gradients pass to the fields that require them, and to
-            parameters and buffers of the step that do. None: the first call records.
+            parameters and buffers of the step that do. None: the first call captures.
         dt: time step [s].
         n: number of steps.
 
@@ -75,9 +75,9 @@ def make_graphed_step(step: nn.Module, state: State | None, dt: float, n: int = 
         raise TypeError(f"step must be a Step or another module (state, dt) -> state, got {shape_of(step)}")
     check_count("n", n, 1)
     refuse_hooks(step)
-    result = GraphedStep(step, dt, int(n), Recordings())
+    result = GraphedStep(step, dt, int(n), CapturedGraphs())
     if state is not None:
-        result.record(state)
+        result.capture(state)
     return result
 
 
@@ -92,12 +92,12 @@ def graphed_steps(steps: Steps, state: State, most: int) -> State:
     """
     step, n, dt, *_ = steps
     assert isinstance(step, nn.Module) and not isinstance(dt, Tensor)
-    recordings = step.__dict__.setdefault("_recordings", Recordings())
+    graphs = step.__dict__.setdefault("_captured_graphs", CapturedGraphs())
     known = StepKey(step)
     in_flight = WorkInFlight(state.x, most)
     while n > 0:
         count = min(n, most)
-        state = GraphedStep(step, dt, count, recordings).after(state, known, alike=True)
+        state = GraphedStep(step, dt, count, graphs).after(state, known, alike=True)
         in_flight.launched()
         n -= count
     return state
@@ -124,18 +124,18 @@ def another_device(step: nn.Module, device: torch.device) -> torch.device | None
 class GraphedStep:
     """Result of `make_graphed_step`: a function state -> state."""
 
-    def __init__(self, step: nn.Module, dt: float, n: int, recordings: Recordings) -> None:
-        self._step, self._dt, self._n, self._recordings = step, dt, n, recordings
+    def __init__(self, step: nn.Module, dt: float, n: int, graphs: CapturedGraphs) -> None:
+        self._step, self._dt, self._n, self._graphs = step, dt, n, graphs
 
     def __call__(self, state: State) -> State:
         check_state(state)
         with control_step(self._step, state, self._n, self._dt) as left:
             return left(self.after(state, StepKey(self._step)))
 
-    def record(self, state: State) -> None:
-        """Record the steps for states like this one, in the current grad mode and autocast."""
+    def capture(self, state: State) -> None:
+        """Capture the steps for states like this one, in the current grad mode and autocast."""
         known = StepKey(self._step)
-        self._recording(self._prepared(state), known, False)
+        self._captured(self._prepared(state), known, False)
 
     def after(self, state: State, known: StepKey, alike: bool = False) -> State:
         """The state n steps later.
@@ -144,24 +144,24 @@ class GraphedStep:
             state: the state.
             known: key of the step as it is now.
             alike: whether all fields that steps change count as requiring a gradient if any input does, so that one
-                recording serves all segments of a rollout.
+                capture serves all segments of a rollout.
         """
         prepared = self._prepared(state)
-        recording, given = self._recording(prepared, known, alike)
-        call = _Call(self._step, self._recordings, recording)
-        if recording.wanted:
+        captured, given = self._captured(prepared, known, alike)
+        call = _Call(self._step, self._graphs, captured)
+        if captured.wanted:
             ends = _Replayed.apply(call, *given)
         else:
             with torch.no_grad():
                 ends = call.forward(given)
-        recording.watch(self._recordings)
-        results: dict[str, Any] = dict(zip(recording.steps.changed, ends, strict=True))
+        captured.watch(self._graphs)
+        results: dict[str, Any] = dict(zip(captured.steps.changed, ends, strict=True))
         if isinstance(self._step, Step) and not isinstance(state.time, Tensor):
             results["time"] = time_after(state.time, self._dt, self._n)
-        return _with(prepared, results | recording.steps.dropped)
+        return _with(prepared, results | captured.steps.dropped)
 
     def _check(self, device: torch.device) -> None:
-        """Check that the step can be recorded now.
+        """Check that the step can be captured now.
 
         Raises:
             ValueError: for a step with hooks, or with a tensor on another device.
@@ -184,10 +184,10 @@ class GraphedStep:
             state = state.replace(C=state.x.new_zeros(*state.x.shape, state.x.shape[1]))  # as after the first step
         return state.replace(time=time_tensor(state))
 
-    def _recording(self, prepared: State, known: StepKey, alike: bool) -> tuple[_Recording, list[Tensor]]:
-        """The recording for a state, made if there is none, and its inputs."""
+    def _captured(self, prepared: State, known: StepKey, alike: bool) -> tuple[_CapturedSteps, list[Tensor]]:
+        """The captured steps for a state, captured now if there are none, and their inputs."""
         inputs = tensors_of(prepared) | known.own
-        fixed = {name: self._recordings.same_content(name, inputs.pop(name)) for name in known.by_content(prepared)}
+        fixed = {name: self._graphs.same_content(name, inputs.pop(name)) for name in known.by_content(prepared)}
         wanted = {name for name, t in inputs.items() if torch.is_grad_enabled() and t.requires_grad}
         if alike and wanted:
             wanted |= {name for name, t in inputs.items() if name in _MOVED or name.startswith(EXTRA)}
@@ -195,15 +195,15 @@ class GraphedStep:
         kinds = frozenset((name, t.shape, t.dtype, t.device, name in wanted) for name, t in inputs.items())
         contents = tuple((name, Same(t)) for name, t in fixed.items())
         around = self._n, self._dt, surroundings(prepared.x.device), contents
-        known.follow(prepared, self._recordings.unseen)
-        recording = self._recordings.get((kinds, around, known.key, known.pools()))
-        if recording is None:
+        known.follow(prepared, self._graphs.unseen)
+        captured = self._graphs.get((kinds, around, known.key, known.pools()))
+        if captured is None:
             self._check(prepared.x.device)
             steps = _Steps(self._step, self._dt, self._n, prepared, fixed, list(inputs))
-            recording = _Recording(steps, inputs, wanted, self._recordings)
+            captured = _CapturedSteps(steps, inputs, wanted, self._graphs)
             known.refresh()
-            self._recordings.keep((kinds, around, known.key, known.pools()), recording)
-        return recording, [inputs[name] for name in recording.steps.names]
+            self._graphs.keep((kinds, around, known.key, known.pools()), captured)
+        return captured, [inputs[name] for name in captured.steps.names]
 
 
 _MOVED = ("x", "v", "C", "F", "J", "temperature", "impulse")
@@ -240,7 +240,7 @@ class _Steps:
     @property
     def step(self) -> nn.Module:
         step = self._step()
-        assert step is not None, "its recordings go with a step"
+        assert step is not None, "its captured graphs go with a step"
         return step
 
     def __call__(self, *tensors: Tensor) -> tuple[Tensor, ...]:
@@ -261,32 +261,32 @@ class _Steps:
 
 
 class _Call:
-    """One call of a recording. Its backward pass recomputes the steps if another call has used the recording since."""
+    """One call of captured steps. Its backward pass recomputes the steps if another call has used the memory since."""
 
-    def __init__(self, step: nn.Module, recordings: Recordings, recording: _Recording) -> None:
-        self._step, self._recordings, self.recording = step, recordings, recording
-        self._mark = object()  # identifies this call in the recordings, which must not keep the call alive
-        self._random = _random_numbers(recording.steps.device) if recording.wanted else None
+    def __init__(self, step: nn.Module, graphs: CapturedGraphs, captured: _CapturedSteps) -> None:
+        self._step, self._graphs, self.captured = step, graphs, captured
+        self._mark = object()  # identifies this call in the captured graphs, which must not keep the call alive
+        self._random = _random_numbers(captured.steps.device) if captured.wanted else None
 
     def forward(self, given: Sequence[Tensor]) -> list[Tensor]:
-        self._recordings.latest = self._mark
-        with self._recordings.in_turn(self.recording.steps.device):
-            return [t.clone() for t in self.recording.graphs.forward(given)]
+        self._graphs.latest = self._mark
+        with self._graphs.in_turn(self.captured.steps.device):
+            return [t.clone() for t in self.captured.graphs.forward(given)]
 
     def gradients(self, given: Sequence[Tensor], grads: Sequence[Tensor | None]) -> list[Tensor | None]:
         """Gradients with respect to the arguments; None where there is none."""
-        graphs = self.recording.graphs
-        with self._recordings.in_turn(self.recording.steps.device):
-            if self._recordings.latest is not self._mark:
+        graphs = self.captured.graphs
+        with self._graphs.in_turn(self.captured.steps.device):
+            if self._graphs.latest is not self._mark:
                 with uncounted(self._step), self._same_random_numbers():
                     graphs.forward(given)
-            self._recordings.latest = None  # the backward pass overwrites its inputs
+            self._graphs.latest = None  # the backward pass overwrites its inputs
             # The next replay overwrites its gradients.
             return [None if grad is None else grad.clone() for grad in graphs.backward(grads)]
 
     @contextlib.contextmanager
     def _same_random_numbers(self) -> Iterator[None]:
-        device = self.recording.steps.device
+        device = self.captured.steps.device
         with torch.random.fork_rng([device] if device.type == "cuda" else []):
             assert self._random is not None
             if device.type == "cuda":
@@ -309,7 +309,7 @@ class _Replayed(torch.autograd.Function):
         ctx.save_for_backward(*given)
         ctx.set_materialize_grads(False)
         ends = call.forward(given)
-        follows = call.recording.graphs.follows
+        follows = call.captured.graphs.follows
         ctx.mark_non_differentiable(*(t for t, with_gradient in zip(ends, follows, strict=True) if not with_gradient))
         return tuple(ends)
 
@@ -319,16 +319,16 @@ class _Replayed(torch.autograd.Function):
         return None, *ctx.call.gradients(ctx.saved_tensors, grads)
 
 
-# ---- recordings
+# ---- captured graphs
 
 
-class _Recording:
+class _CapturedSteps:
     """Graphs of steps and their gradients for one kind of states, with the status tensors that count their blocks."""
 
-    def __init__(self, steps: _Steps, inputs: Mapping[str, Tensor], wanted: set[str], recordings: Recordings) -> None:
+    def __init__(self, steps: _Steps, inputs: Mapping[str, Tensor], wanted: set[str], graphs: CapturedGraphs) -> None:
         self.steps, self.wanted = steps, bool(wanted)
-        kept, device = recordings.some(), steps.device
-        recordings.latest = None
+        kept, device = graphs.some(), steps.device
+        graphs.latest = None
         names, with_gradients = steps.names, torch.is_grad_enabled()
         with contextlib.ExitStack() as stack:
             stack.enter_context(own_pools())
@@ -342,20 +342,20 @@ class _Recording:
             with uncounted(steps.step), torch.random.fork_rng([device] if device.type == "cuda" else []):
                 for _ in range(TRIALS):
                     self.graphs.try_out()
-            self.graphs.record(None if kept is None else kept.graphs)
+            self.graphs.capture(None if kept is None else kept.graphs)
         # The graphs read these tensors, which mixtures replace for other particles.
         self._indices = [m.indices for m in steps.step.modules() if isinstance(m, Mixture)]
         self._counts = [count for _, _, count in counts_of(steps.step)]  # The graphs write to these.
         parts = [m for m in steps.step.modules() if isinstance(m, Step)]
         self._statuses = [(part.grid, part.status) for part in parts if part.status is not None]
 
-    def watch(self, recordings: Recordings) -> None:
+    def watch(self, graphs: CapturedGraphs) -> None:
         """Request the block count of the latest steps from the device, unless a request is pending."""
         for grid, status in self._statuses:
             if not grid.watches:
-                recordings.unseen = 0
+                graphs.unseen = 0
             grid.watch(status)
-        recordings.unseen += 1
+        graphs.unseen += 1
 
 
 def no_hooks() -> contextlib.AbstractContextManager[Any]:
@@ -376,7 +376,7 @@ class Graphs:
         wanted: whether the gradient by an argument is computed, for each of them.
 
     Attributes:
-        follows: whether a result has a gradient, for each of them; set by `record`.
+        follows: whether a result has a gradient, for each of them; set by `capture`.
     """
 
     def __init__(
@@ -389,7 +389,7 @@ class Graphs:
 
     def try_out(self) -> None:
         """Call the function and its gradients once on the stream of graphs, so that work of a first call is done before
-        the recording.
+        the capture.
 
         Raises:
             ValueError: gradients would pass to a tensor that is no argument, and replays would lose them.
@@ -413,16 +413,16 @@ class Graphs:
             found = iter(torch.autograd.grad(outputs, wanted, grads, allow_unused=True))
         return [next(found) if t.requires_grad else None for t in self.read]
 
-    def record(self, beside: Graphs | None) -> None:
-        """Record the graphs, in the memory of `beside` if given."""
+    def capture(self, beside: Graphs | None) -> None:
+        """Capture the graphs, in the memory of `beside` if given."""
         self._forward, self._backward = torch.cuda.CUDAGraph(), torch.cuda.CUDAGraph()
         self._memory: GraphMemory = GraphMemory(self._device, waits=True) if beside is None else beside._memory
-        with self._memory.recorded(self._forward):
+        with self._memory.capturing(self._forward):
             ends = self._steps(*self.read)
         self.follows = [t.requires_grad for t in ends]
         self._grads = [torch.zeros_like(t) for t in ends if t.requires_grad]
         if self._grads:
-            with self._memory.recorded(self._backward):
+            with self._memory.capturing(self._backward):
                 self._found = self._gradients(ends, self._grads)
         self._ends = [t.detach() for t in ends]
 

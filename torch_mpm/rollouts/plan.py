@@ -16,8 +16,8 @@ from ..boundaries import Obstacle
 from ..boundaries.obstacles import motion_tensors
 from ..cuda_graphs.capture import (
     NUMBERS,
+    CapturedGraphs,
     DeviceConstantCache,
-    Recordings,
     is_captured,
     is_of_library,
     is_traced,
@@ -381,7 +381,7 @@ def _why_not_graphs(steps: Steps, state: State) -> str | None:
     return "there are no particles" if len(state) == 0 else None
 
 
-_OWN = (DeviceConstantCache, Recordings, ActivationRecord, Grid)
+_OWN = (DeviceConstantCache, CapturedGraphs, ActivationRecord, Grid)
 """Made for graphs."""
 
 

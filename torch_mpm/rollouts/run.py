@@ -62,7 +62,7 @@ def rollout(
             a second graph computes their gradients. It pays for networks in a step, where launching the kernels takes
             longer than running them. The state is stored every `graph` steps, and the backward pass recomputes the
             steps in between. The step stores the graphs for the next rollout; `make_graphed_step` describes when they
-            are recorded again. `step` must be a `Step` or another module. Without effect on the CPU, and where
+            are captured again. `step` must be a `Step` or another module. Without effect on the CPU, and where
             `Step.explain` gives a reason against graphs.
         schedule: schedule of the fused op, see `plan_rollout`; None for the fastest one.
         plan: the plan of `plan_rollout` for these steps, in place of `checkpoint`, `graph` and `schedule`. None: the

@@ -29,7 +29,7 @@ MOST_SEGMENTS = 64
 MOST_SUBSTEPS = 2**16
 """Substeps of a scene in a call: a scene whose limit shrinks without bound must not delay the others."""
 LEAST_REPLAYS = 3
-"""Number of segments from which recording a graph pays."""
+"""Number of segments from which the capture of a graph pays."""
 ROUNDING = 1e-9
 """Tolerance in the number of substeps, below which no additional one is computed."""
 
@@ -204,7 +204,7 @@ class Clocks:
         self._take(self._left)
 
     def _plan_of_replays(self, n: int, options: dict[str, Any]) -> RolloutPlan | None:
-        """The plan of a segment that is replayed as a CUDA graph; None if it cannot be recorded."""
+        """The plan of a segment that is replayed as a CUDA graph; None if it cannot be captured."""
         step, state = self.step, self.state
         if not state.x.is_cuda or follows_paths(step):
             return None

@@ -170,13 +170,13 @@ class DruckerPragerPlasticity(_Moduli, Plasticity):
 
 
 class MLPBlock(nn.Module):
-    """A linear layer, a norm and an activation; names of parameters are NCLaw's, so that its checkpoints load."""
+    """A linear layer, a norm and a nonlinearity; names of parameters are NCLaw's, so that its checkpoints load."""
 
     def __init__(self, width: int, next_width: int, no_bias: bool, norm: str | None, nonlinearity: str | None) -> None:
         super().__init__()
         self.fc = nn.Linear(width, next_width, bias=not no_bias and norm is None)
         self.norm = _chosen("norm", norm, NORMS)(next_width, not no_bias)
-        self.nonlinearity = _chosen("nonlinearity", nonlinearity, ACTIVATIONS)()
+        self.nonlinearity = _chosen("nonlinearity", nonlinearity, NONLINEARITIES)()
 
     def forward(self, x: Tensor) -> Tensor:
         return self.nonlinearity(self.norm(self.fc(x)))
@@ -187,7 +187,7 @@ NORMS: dict[str | None, Callable[[int, bool], nn.Module]] = {
     "ln": lambda width, affine: nn.LayerNorm(width, elementwise_affine=affine),
     "bn": lambda width, affine: nn.BatchNorm1d(width, affine=affine),
 }
-ACTIVATIONS: dict[str | None, Callable[[], nn.Module]] = {
+NONLINEARITIES: dict[str | None, Callable[[], nn.Module]] = {
     **{None: nn.Identity, "relu": nn.ReLU, "tanh": nn.Tanh, "silu": nn.SiLU, "swish": nn.SiLU},
     **{"gelu": nn.GELU, "elu": nn.ELU},
 }

@@ -1,4 +1,4 @@
-"""Memory of large results on the CPU: csrc/cpu/pool.h."""
+"""Memory of large results on the CPU: csrc/cpu/memory_cache.h."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torch_mpm.ops import law_update
 
-PARTICLES = 60_000  # a stress tensor of 2 MB, which comes from the pool
+PARTICLES = 60_000  # a stress tensor of 2 MB, which comes from the cache
 
 
 def deformation(scale: float) -> Tensor:

@@ -8,7 +8,7 @@
 // or kKeptAnyway, so that the next rollout of a training loop finds the memory of the previous one.
 namespace mpm::cpu {
 
-constexpr int64_t kPooled = 1 << 20;  // number of bytes from which a tensor is allocated from the pool
+constexpr int64_t kLeastCached = 1 << 20;  // bytes from which the memory of a tensor is stored
 constexpr int64_t kKept = 4, kKeptAnyway = 128 << 20;
 
 struct Buffer {

@@ -1,4 +1,4 @@
-#include "cpu/pool.h"
+#include "cpu/memory_cache.h"
 
 #include <sys/mman.h>
 
@@ -36,7 +36,7 @@ void unmap(Buffer* b) {
   delete b;
 }
 
-struct Pool {
+struct MemoryCache {
   std::mutex mutex;
   std::vector<Buffer*> kept;  // the most recently released buffer is last: it may still be in a cache
   int64_t kept_bytes = 0, living_bytes = 0, count = 0;
@@ -57,41 +57,41 @@ struct Pool {
 };
 
 // Never destroyed: tensors may outlive it at the end of the process.
-Pool& pool() {
-  static Pool* p = new Pool;
-  return *p;
+MemoryCache& memory_cache() {
+  static MemoryCache* cache = new MemoryCache;
+  return *cache;
 }
 
 }  // namespace
 
 Buffer* take(int64_t bytes) {
-  Pool& p = pool();
-  std::unique_lock lock(p.mutex);
-  Buffer* b = p.find(bytes);
-  const int64_t offset = p.count++ * kStagger % kPage;
+  MemoryCache& cache = memory_cache();
+  std::unique_lock lock(cache.mutex);
+  Buffer* b = cache.find(bytes);
+  const int64_t offset = cache.count++ * kStagger % kPage;
   if (!b) {
     lock.unlock();
     b = map(bytes, offset);
     if (!b) return nullptr;
     lock.lock();
   }
-  p.living_bytes += b->size;
+  cache.living_bytes += b->size;
   return b;
 }
 
 void give_back(Buffer* buffer) {
-  Pool& p = pool();
+  MemoryCache& cache = memory_cache();
   std::vector<Buffer*> surplus;
   {
-    const std::lock_guard lock(p.mutex);
-    p.living_bytes -= buffer->size;
-    p.kept_bytes += buffer->size;
-    p.kept.push_back(buffer);
-    const int64_t most = kKept * p.living_bytes > kKeptAnyway ? kKept * p.living_bytes : kKeptAnyway;
+    const std::lock_guard lock(cache.mutex);
+    cache.living_bytes -= buffer->size;
+    cache.kept_bytes += buffer->size;
+    cache.kept.push_back(buffer);
+    const int64_t most = kKept * cache.living_bytes > kKeptAnyway ? kKept * cache.living_bytes : kKeptAnyway;
     size_t oldest = 0;
-    for (; p.kept_bytes > most; oldest++) p.kept_bytes -= p.kept[oldest]->size;
-    surplus.assign(p.kept.begin(), p.kept.begin() + ptrdiff_t(oldest));
-    p.kept.erase(p.kept.begin(), p.kept.begin() + ptrdiff_t(oldest));
+    for (; cache.kept_bytes > most; oldest++) cache.kept_bytes -= cache.kept[oldest]->size;
+    surplus.assign(cache.kept.begin(), cache.kept.begin() + ptrdiff_t(oldest));
+    cache.kept.erase(cache.kept.begin(), cache.kept.begin() + ptrdiff_t(oldest));
   }
   for (Buffer* b : surplus) unmap(b);
 }
