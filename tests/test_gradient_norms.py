@@ -70,7 +70,7 @@ def test_no_particles_and_no_time(device):
         mpm.rollout(step, state, 3, 0.0, norms=mpm.GradientNorms())
 
 
-def test_a_start_that_is_used_elsewhere_is_recorded_as_a_start(device):
+def test_a_start_that_is_used_elsewhere_counts_as_a_start(device):
     step, state = make("in one op"), batch(device)
     norms, scale = mpm.GradientNorms(), torch.ones((), dtype=torch.float64, device=device, requires_grad=True)
     v = scale * torch.ones_like(state.v)
@@ -109,7 +109,7 @@ def test_a_truncation_for_gradients_that_grow_or_vanish(device):
     assert spring([1e200, 1.0], device).truncation() == 1  # of a gradient that is infinite
 
 
-def test_a_record_begins_anew_and_needs_a_backward_pass(device):
+def test_norms_begin_anew_and_need_a_backward_pass(device):
     step, state, norms = make("in one op"), batch(device), mpm.GradientNorms()
     with pytest.raises(ValueError, match=r"GradientNorms\.truncation needs a backward pass"):
         norms.truncation()

@@ -203,7 +203,7 @@ def test_rollouts_from_graphs_leave_nothing_behind():
         state = mpm.rollout(step, state, 10, DT)
         gc.collect()
         by_replays, by_steps = ([size_after(take) for _ in range(6)] for take in (mpm.rollout, one_by_one))
-    assert len(step._activations.all()) == 1
+    assert len(step._error_status.all()) == 1
     # Some tools that watch a GPU keep the tensors of Python calls alive.
     assert by_replays[-1] - by_replays[0] <= by_steps[-1] - by_steps[0]
     step.check()

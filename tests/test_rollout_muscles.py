@@ -23,7 +23,7 @@ def fibres(dim: int, device: str, count: int = 300, dtype: torch.dtype = F64) ->
 
 
 def flexed(state: mpm.State, most: float = 3e3) -> mpm.State:
-    """With an activation of either sign for each particle."""
+    """With a muscle activation of either sign for each particle."""
     a = most * torch.randn(len(state), generator=torch.Generator().manual_seed(4), dtype=F64).to(state.x)
     return state.replace(extra={**state.extra, "activation": a})
 
@@ -63,7 +63,7 @@ def test_muscles_of_a_mixture(sort, dim, device):
 
 @torch.no_grad()
 def test_muscles_in_scenes_with_obstacles_that_rearrange(device):
-    """On the CPU the op puts particles into another order, and their activations with them."""
+    """On the CPU the op puts particles into another order, and their muscle activations with them."""
     scenes, count = 2, 4000
     scene = (torch.arange(count, device=device) % scenes).int()
     path = lambda t: torch.stack([0.5 + 5 * t, 0.4 + 0 * t, 0.5 + 0 * t])  # noqa: E731
@@ -79,7 +79,7 @@ def test_muscles_in_scenes_with_obstacles_that_rearrange(device):
 @pytest.mark.parametrize("law", ["neo_hookean", "von_mises", "viscoelastic", "sand"])
 @pytest.mark.parametrize("every", [1, 3, mpm.Checkpoints(memory=1e9)], ids=str)
 def test_gradients(law, every, dim, device):
-    """By activation, direction of each particle and moduli, beside a law that changes nothing and one that flows."""
+    """By muscle activation, directions and moduli, beside a law that changes nothing and one that flows."""
     muscle = with_gradients(mpm.Active(LAWS_HERE[law](), fibres(dim, device).requires_grad_()))
     step = mpm.Step(unit_box(dim), muscle, walls="separate").to(device)
     state = flexed(moving(step, blob(device, dim)))

@@ -51,7 +51,7 @@ def with_gradient(step: mpm.Step, state: mpm.State) -> None:
         torch.autograd.grad(end.x.sum(), v)
 
 
-def while_recording(step: mpm.Step, state: mpm.State) -> None:
+def while_tracking(step: mpm.Step, state: mpm.State) -> None:
     with alarms(stop, 0.05):
         mpm.rollout(step, state.replace(v=state.v.clone().requires_grad_()), MANY, 1e-5, 100)
 
@@ -71,7 +71,7 @@ def to_a_time(step: mpm.Step, state: mpm.State) -> None:
         mpm.rollout_to(step, state, 1e3, every=1000, most=MANY)
 
 
-WAYS = (without_gradient, of_scenes, while_recording, with_gradient, to_a_time)
+WAYS = (without_gradient, of_scenes, while_tracking, with_gradient, to_a_time)
 
 
 @pytest.mark.parametrize("way", WAYS, ids=lambda way: way.__name__)

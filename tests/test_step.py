@@ -219,27 +219,27 @@ def test_scenes_in_a_batch_are_as_if_alone(device, dim):
 
 
 @pytest.mark.parametrize("law", [mpm.NeoHookean(E=1e4, nu=0.3), mpm.QuarticSand(E=1e4, nu=0.3)])
-def test_recording_changes_no_result(device, dim, law):
-    """A step is the same whether autograd records it, is off, or is absent; recorded just where something needs it."""
+def test_tracking_changes_no_result(device, dim, law):
+    """A step is the same whether autograd tracks it, is off, or is absent; tracked just where something needs it."""
     grid = mpm.Grid(0.1, (0,) * dim, (1,) * dim)
     step, state = mpm.Step(grid, law, gravity=(0, -9.8, 0)[:dim], walls="slip"), block_state(dim, device)
-    recorded = mpm.rollout(step, state.replace(v=state.v.clone().requires_grad_()), 3, 1e-3)
+    tracked = mpm.rollout(step, state.replace(v=state.v.clone().requires_grad_()), 3, 1e-3)
     plain = mpm.rollout(step, state, 3, 1e-3)
     with torch.no_grad():
         off = mpm.rollout(step, state.replace(v=state.v.clone().requires_grad_()), 3, 1e-3)
     with torch.inference_mode():
         absent = mpm.rollout(step, state, 3, 1e-3)
     for name in ("x", "v", "C", "F"):
-        assert getattr(recorded, name).requires_grad
+        assert getattr(tracked, name).requires_grad
         for other in (plain, off, absent):
             assert not getattr(other, name).requires_grad
-            assert relative_error(getattr(other, name), getattr(recorded, name).detach()) < 1e-13
+            assert relative_error(getattr(other, name), getattr(tracked, name).detach()) < 1e-13
 
 
 @pytest.mark.parametrize(
     "law", [mpm.NeoHookean(E=1e4, nu=0.3), mpm.FixedCorotated(E=1e4, nu=0.3), mpm.QuarticSand(E=1e4, nu=0.3)]
 )
-def test_a_step_can_be_recorded_after_inference(device, dim, law):
+def test_a_step_can_be_tracked_after_inference(device, dim, law):
     """Cached tensors of a step may be created in inference mode and be saved for a gradient later."""
     grid = mpm.Grid(0.1, (0,) * dim, (1,) * dim)
     step = mpm.Step(grid, law, gravity=(0, -9.8, 0)[:dim], walls="slip")
@@ -481,7 +481,7 @@ def test_replays_of_a_graph_are_watched(inference):
         for _ in range(3):
             graph.replay()
         step.check()
-        activations = [status[0, 5].item() for status in step._activations.all()]
+        activations = [status[0, 5].item() for status in step._error_status.all()]
         assert activations == [2, 7]  # of eager steps, and with replays
         inside = static.x[5].clone()
         static.x[5] = -9.0

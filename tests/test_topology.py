@@ -146,9 +146,9 @@ def test_a_large_domain_moves_as_a_small_one(dim, scenes, deterministic):
         before = grid.activate(state.x, state.scene).block.sort()[0]
         assert not torch.equal(before, grid.activate(rolled.x, rolled.scene).block.sort()[0])
         v = state.v.clone().requires_grad_()
-        recorded = mpm.rollout(step, state.replace(v=v), 12, 1e-3)
-        loss = recorded.x.nan_to_num().square().sum() + recorded.v.nan_to_num().square().sum()
-        ends.append((rolled.x, rolled.v, rolled.C, rolled.F, recorded.x, torch.autograd.grad(loss, v)[0]))
+        tracked = mpm.rollout(step, state.replace(v=v), 12, 1e-3)
+        loss = tracked.x.nan_to_num().square().sum() + tracked.v.nan_to_num().square().sum()
+        ends.append((rolled.x, rolled.v, rolled.C, rolled.F, tracked.x, torch.autograd.grad(loss, v)[0]))
     for small, large in zip(*ends, strict=True):
         assert torch.equal(small.nan_to_num(7.0), large.nan_to_num(7.0))
 

@@ -151,7 +151,7 @@ def in_no_order(side: int, device: str) -> Setup:
 
 
 def with_muscles(side: int, device: str) -> Setup:
-    """The cube with an activation of each particle."""
+    """The cube with a muscle activation of each particle."""
     s = setup(work.make(side), device)
     step = changed(s, law=mpm.Active(s.step.law, (0.0, 1.0, 0.0)))
     state = step.prepare(s.state)

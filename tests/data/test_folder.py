@@ -79,8 +79,8 @@ def _first_mass(data):
 def test_other_processes_open_files_of_their_own(path, method):
     data = DatasetFolder(path)
     expected = _first_mass(data)
-    with get_context(method).Pool(1) as pool:
-        assert pool.apply(_first_mass, (data,)) == expected
+    with get_context(method).Pool(1) as process:
+        assert process.apply(_first_mass, (data,)) == expected
     assert pickle.loads(pickle.dumps(data)).scene(9).particles == data.scene(9).particles
 
 

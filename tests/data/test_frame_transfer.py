@@ -1,4 +1,4 @@
-"""Recordings: frames arrive in the arrays of their scenes, and packed, by any number of threads; errors are raised."""
+"""Frames arrive in the arrays of their scenes, and packed, by any number of threads; errors are raised."""
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -9,9 +9,9 @@ import torch
 
 pytest.importorskip("isal")
 
-from torch_mpm.data import recording
+from torch_mpm.data import frame_transfer
+from torch_mpm.data.frame_transfer import FrameTransfer
 from torch_mpm.data.packing import Packing, packed
-from torch_mpm.data.recording import Recording
 from torch_mpm.data.statistics import motion_sums
 
 FRAMES, PARTICLES = 45, [300, 0, 1, 700]
@@ -21,10 +21,10 @@ ROW = 4 * sum(PARTICLES) * 7
 
 @pytest.fixture(params=["alone", "executor", "packed"])
 def threads(request):
-    """Arguments of a recording."""
-    with ThreadPoolExecutor(3) as pool:
+    """Arguments of a transfer."""
+    with ThreadPoolExecutor(3) as executor:
         packed = {"packed": [True, True, False, True]} if request.param == "packed" else {}
-        yield {} if request.param == "alone" else {"executor": pool, **packed}
+        yield {} if request.param == "alone" else {"executor": executor, **packed}
 
 
 def frames_of(device):
@@ -36,13 +36,13 @@ def frames_of(device):
 
 @pytest.mark.parametrize("slab", [1, 7, 1000])
 def test_frames_arrive_in_the_arrays_of_their_scenes(monkeypatch, device, threads, slab):
-    monkeypatch.setattr(recording, "SLAB_BYTES", slab * ROW)
+    monkeypatch.setattr(frame_transfer, "SLAB_BYTES", slab * ROW)
     values, frames = frames_of(device)
-    recorder = Recording(FRAMES, PARTICLES, SHAPES, torch.device(device), **threads)
+    transfer = FrameTransfer(FRAMES, PARTICLES, SHAPES, torch.device(device), **threads)
     for frame in frames:
-        recorder.put(frame)
+        transfer.put(frame)
     ends = np.cumsum(PARTICLES)[:-1]
-    for k, scene in enumerate(recorder.finish()):
+    for k, scene in enumerate(transfer.finish()):
         wanted = "packed" in threads and threads["packed"][k] and PARTICLES[k] > 0
         assert sorted(scene.packed) == (sorted(SHAPES) if wanted else [])
         assert sorted(scene.arrays) == ([] if wanted else sorted(SHAPES))
@@ -64,18 +64,18 @@ def test_frames_arrive_in_the_arrays_of_their_scenes(monkeypatch, device, thread
 
 @pytest.mark.parametrize("slab", [7, 1000])
 def test_particles_behind_those_of_a_scene(monkeypatch, device, threads, slab):
-    monkeypatch.setattr(recording, "SLAB_BYTES", slab * ROW)
+    monkeypatch.setattr(frame_transfer, "SLAB_BYTES", slab * ROW)
     frames = frames_of(device)[1]
     rng, counts = np.random.default_rng(1), [20, 0, None, 5]
     behind = [
         {} if n is None else {k: rng.random((FRAMES, n, *s), np.float32) for k, s in SHAPES.items()} for n in counts
     ]
-    recorder = Recording(FRAMES, PARTICLES, SHAPES, torch.device(device), **threads, behind=behind)
-    without = Recording(FRAMES, PARTICLES, SHAPES, torch.device(device))
+    transfer = FrameTransfer(FRAMES, PARTICLES, SHAPES, torch.device(device), **threads, behind=behind)
+    without = FrameTransfer(FRAMES, PARTICLES, SHAPES, torch.device(device))
     for frame in frames:
-        recorder.put(frame)
+        transfer.put(frame)
         without.put(frame)
-    for with_others, alone, others in zip(recorder.finish(), without.finish(), behind, strict=True):
+    for with_others, alone, others in zip(transfer.finish(), without.finish(), behind, strict=True):
         assert with_others.motion == (motion_sums(alone.arrays["position"]) if "packed" in threads else None)
         for name, own in alone.arrays.items():
             expected = np.concatenate([own, others[name]], axis=1) if others else own
@@ -86,7 +86,7 @@ def test_particles_behind_those_of_a_scene(monkeypatch, device, threads, slab):
 
 
 def test_what_goes_wrong_in_a_thread_is_raised_in_the_end(monkeypatch):
-    monkeypatch.setattr(recording, "SLAB_BYTES", ROW)
+    monkeypatch.setattr(frame_transfer, "SLAB_BYTES", ROW)
     append, calls = Packing.append, []
 
     def broken(self, rows):
@@ -97,29 +97,29 @@ def test_what_goes_wrong_in_a_thread_is_raised_in_the_end(monkeypatch):
 
     monkeypatch.setattr(Packing, "append", broken)
     _, frames = frames_of("cpu")
-    with ThreadPoolExecutor(2) as pool:
-        recorder = Recording(FRAMES, PARTICLES, SHAPES, torch.device("cpu"), pool, [True] * 4)
+    with ThreadPoolExecutor(2) as executor:
+        transfer = FrameTransfer(FRAMES, PARTICLES, SHAPES, torch.device("cpu"), executor, [True] * 4)
         for frame in frames:  # far more than the queue holds
-            recorder.put(frame)
+            transfer.put(frame)
         with pytest.raises(MemoryError, match="no room"):
-            recorder.finish()
-        recorder.abandon()
+            transfer.finish()
+        transfer.abandon()
     assert not names_of_threads()
 
 
 def test_threads_that_are_gone_are_noticed():
     _, frames = frames_of("cpu")
-    pool = ThreadPoolExecutor(1)
-    pool.shutdown()
-    recorder = Recording(FRAMES, PARTICLES, SHAPES, torch.device("cpu"), pool)
+    executor = ThreadPoolExecutor(1)
+    executor.shutdown()
+    transfer = FrameTransfer(FRAMES, PARTICLES, SHAPES, torch.device("cpu"), executor)
     for frame in frames:
-        recorder.put(frame)
+        transfer.put(frame)
     with pytest.raises(RuntimeError, match="shutdown"):
-        recorder.finish()
+        transfer.finish()
 
 
-def test_a_recording_that_is_abandoned_takes_nothing_more(monkeypatch, device):
-    monkeypatch.setattr(recording, "SLAB_BYTES", ROW)
+def test_a_transfer_that_is_abandoned_takes_nothing_more(monkeypatch, device):
+    monkeypatch.setattr(frame_transfer, "SLAB_BYTES", ROW)
     _, frames = frames_of(device)
     first, go_on, taken = threading.Event(), threading.Event(), []
 
@@ -129,14 +129,14 @@ def test_a_recording_that_is_abandoned_takes_nothing_more(monkeypatch, device):
         go_on.wait()
 
     monkeypatch.setattr(Packing, "append", held)
-    with ThreadPoolExecutor(1) as pool:
-        recorder = Recording(FRAMES, PARTICLES, SHAPES, torch.device(device), pool, [True] * 4)
+    with ThreadPoolExecutor(1) as executor:
+        transfer = FrameTransfer(FRAMES, PARTICLES, SHAPES, torch.device(device), executor, [True] * 4)
         for frame in frames[:3]:
-            recorder.put(frame)
+            transfer.put(frame)
         first.wait()
-        ending = threading.Thread(target=recorder.abandon)
+        ending = threading.Thread(target=transfer.abandon)
         ending.start()
-        while not recorder._abandoned:
+        while not transfer._abandoned:
             pass
         go_on.set()
         ending.join()
@@ -144,4 +144,4 @@ def test_a_recording_that_is_abandoned_takes_nothing_more(monkeypatch, device):
 
 
 def names_of_threads():
-    return [t.name for t in threading.enumerate() if t.name == "torch_mpm recording"]
+    return [t.name for t in threading.enumerate() if t.name == "torch_mpm frames"]

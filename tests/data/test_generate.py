@@ -285,8 +285,8 @@ def test_what_is_packed_beside_the_simulation_is_the_same(device):
         obstacle=[{"count": {"choice": [0, 1]}, "shape": "sphere", "center": [0.5, 0.1], "radius": 0.08}],
     )  # fmt: skip
     prepared = []
-    with ThreadPoolExecutor(3) as pool:
-        for packers in (None, pool):
+    with ThreadPoolExecutor(3) as executor:
+        for packers in (None, executor):
             drawn = draw(made, range(7), torch.device(device))
             simulate(made, drawn, torch.device(device), packers=packers)
             assert {o.attempts for o in drawn.outcomes} == {1, 2} and not any(o.failure for o in drawn.outcomes)
@@ -309,9 +309,9 @@ def test_a_simulation_that_is_broken_off_leaves_no_threads(device):
         if frame == 5:
             raise KeyboardInterrupt
 
-    with ThreadPoolExecutor(2) as pool, pytest.raises(KeyboardInterrupt):
-        simulate(made, drawn, torch.device(device), broken, pool)
-    assert not [t for t in threading.enumerate() if t.name == "torch_mpm recording"]
+    with ThreadPoolExecutor(2) as executor, pytest.raises(KeyboardInterrupt):
+        simulate(made, drawn, torch.device(device), broken, executor)
+    assert not [t for t in threading.enumerate() if t.name == "torch_mpm frames"]
 
 
 def test_a_scene_that_needs_too_many_steps_fails_alone(tmp_path):

@@ -47,8 +47,8 @@ def path(tmp_path):
 @pytest.fixture
 def written(path):
     """Scenes 3, 4 (failed), 5 (no particles) and 6."""
-    with ThreadPoolExecutor(2) as pool:
-        prepared = pool.map(prepare_scene, [arrays(6, dim=3), arrays(3), {}, arrays(5, particles=0)])
+    with ThreadPoolExecutor(2) as executor:
+        prepared = executor.map(prepare_scene, [arrays(6, dim=3), arrays(3), {}, arrays(5, particles=0)])
     with ShardWriter(path, {"version": "1"}) as writer:
         for number, scene, attributes in zip([6, 3, 4, 5], prepared, [VALID, VALID, FAILED, VALID], strict=True):
             writer.add(number, scene, attributes)

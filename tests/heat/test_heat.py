@@ -317,7 +317,7 @@ def test_temperature_turns_with_a_body(device):
 
 
 class Dissipating(mpm.Material):
-    """Law without stress that dissipates 7 J/m³ in every step where dissipation is recorded."""
+    """Law without stress that dissipates 7 J/m³ in every step where dissipation is stored."""
 
     def update(self, state):
         fields = {"dissipated": torch.full_like(state.mass, 7.0)} if self.dissipation else {}

@@ -195,7 +195,7 @@ def test_every_solve_of_a_backward_pass_counts(device):
 
 
 def test_an_integrator_given_to_two_steps(device):
-    """Each has a record of its own."""
+    """Each has a status of its own."""
     grid, values = inputs(2, device)
     integrator = Implicit(**TIGHT)
     steps = [mpm.Step(grid, mpm.NeoHookean(E=E, nu=0.3), integrator=integrator) for E in (1e4, 1e6)]

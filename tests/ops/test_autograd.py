@@ -258,7 +258,7 @@ def assert_same(got, expected, factor=1.0):
             torch.testing.assert_close(a, factor * b, rtol=1e-9, atol=1e-11 * factor * float(b.abs().max()))
 
 
-def recorded_ops(case):
+def tracked_ops(case):
     """Names of the ops in the graphs of the case, and of its gradient."""
     leaves, found, seen = case.leaves(), set(), set()
     loss = case.loss(*leaves)
@@ -276,10 +276,10 @@ def recorded_ops(case):
 
 
 def test_every_op_is_in_a_case():
-    recorded = set().union(*(recorded_ops(make_case(name, "cpu")) for name in CASES))
+    tracked = set().union(*(tracked_ops(make_case(name, "cpu")) for name in CASES))
     names = [n for n in torch._C._dispatch_get_all_op_names() if n.startswith("torch_mpm::")]
     registered = {n.partition("::")[2] for n in names if torch._C._dispatch_has_kernel_for_dispatch_key(n, "Autograd")}
-    assert registered == recorded | NO_GRADIENT
+    assert registered == tracked | NO_GRADIENT
 
 
 # ---- saved tensors
@@ -336,7 +336,7 @@ def test_second_derivatives_with_saved_tensors_elsewhere(case, wrap):
 
 @pytest.mark.parametrize("first,then", [("F", "F"), ("E", "F"), ("F", "E")])
 def test_a_custom_principal_law_has_no_second_derivatives(first, then, device):
-    """Its axes and divided differences are not recorded: second derivatives are refused rather than wrong."""
+    """Its axes and divided differences are not tracked: second derivatives are refused rather than wrong."""
     leaves = {"F": strained(2, device).requires_grad_(), "E": number(3.0, device).requires_grad_()}
     law = mpm.CustomPrincipalLaw(lambda sigma: leaves["E"] * sigma.log() ** 3)
     F = leaves["F"]
@@ -426,7 +426,7 @@ REFUSED = "torch_mpm::.* has no forward-mode derivative .*: use reverse mode"
 def test_forward_mode_is_refused(case):
     """Never tangents of zero: by torch.func.jvp, by dual tensors with and without grad mode, of gradients too."""
     tangents = tuple(torch.ones_like(t) for t in case.inputs)
-    if not recorded_ops(case):  # torch code alone, which has tangents
+    if not tracked_ops(case):  # torch code alone, which has tangents
         _, tangent = torch.func.jvp(case.loss, tuple(case.inputs), tangents)
         torch.testing.assert_close(tangent, sum((g * t).sum() for g, t in zip(case.gradient(), tangents, strict=True)))
         return
@@ -435,8 +435,8 @@ def test_forward_mode_is_refused(case):
     if len(case.inputs) == 1 or case.twice:
         with pytest.raises(NotImplementedError, match=REFUSED):
             torch.func.jvp(torch.func.grad(case.loss), tuple(case.inputs), tangents)
-    for recording in (True, False):
-        with forward_ad.dual_level(), torch.set_grad_enabled(recording):
+    for grad_mode in (True, False):
+        with forward_ad.dual_level(), torch.set_grad_enabled(grad_mode):
             assert case.loss(*case.inputs).isfinite()  # without a tangent
             duals = [forward_ad.make_dual(t, s) for t, s in zip(case.inputs, tangents, strict=True)]
             with pytest.raises(NotImplementedError, match=REFUSED):

@@ -93,7 +93,7 @@ def test_a_rollout_compiles_once(name, device):
 
 @pytest.mark.parametrize("name", ["tensor dt", "learned law", "learned stretches"])
 def test_gradients_of_a_compiled_rollout(name, device):
-    """Recorded by AOTAutograd, in one compilation: of the state, and of the weights of a network."""
+    """Traced by AOTAutograd, in one compilation: of the state, and of the weights of a network."""
     step, state, dt = make_step(name, device)
     fields = ("x", "v", "C", "F")
 

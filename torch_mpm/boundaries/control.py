@@ -375,9 +375,9 @@ def _report(step: Any, obstacles: Sequence[Obstacle], courses: Mapping[int, Cour
 
 def _count(step: Any, wrong: Tensor) -> None:
     for module in step.modules():
-        record = getattr(module, "_activations", None)
-        if record is not None and hasattr(module, "grid"):  # a `Step` or a `Heat`
-            record.contradict(wrong, module.grid.scenes)
+        status = getattr(module, "_error_status", None)
+        if status is not None and hasattr(module, "grid"):  # a `Step` or a `Heat`
+            status.contradict(wrong, module.grid.scenes)
 
 
 # ---- one obstacle

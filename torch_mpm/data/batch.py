@@ -16,7 +16,7 @@ from ..rollouts import rollout
 from ..scene import fields, heap
 from ..scene.build import Built
 from ..state.state import State, _take_all
-from .recording import Array, Recorded, Recording
+from .frame_transfer import Array, FrameTransfer, StoredFrames
 
 LOOK = 8
 """Frames between two checks of the stability limit and the validity of the particles, and between two reorderings."""
@@ -83,7 +83,7 @@ def simulate(
     executor: Executor | None = None,
     packed: Sequence[bool] | None = None,
     behind: Sequence[Mapping[str, Array]] | None = None,
-) -> tuple[list[Recorded], list[str]]:
+) -> tuple[list[StoredFrames], list[str]]:
     """Simulate all scenes of a batch.
 
     Args:
@@ -93,7 +93,7 @@ def simulate(
         interval: time between two frames [s].
         count: substeps per frame.
         told: called after each frame has been queued.
-        executor, packed, behind: as in `Recording`.
+        executor, packed, behind: as in `FrameTransfer`.
 
     Returns:
         Fields of each scene, and the reason of its failure; "" for a valid scene.
@@ -101,19 +101,19 @@ def simulate(
     _leave_room(built)
     while True:
         shapes = shapes_of(names, built.grid.dim)
-        recording = Recording(frames, particles_of(built), shapes, built.state.x.device, executor, packed, behind)
+        transfer = FrameTransfer(frames, particles_of(built), shapes, built.state.x.device, executor, packed, behind)
         try:
-            reports = _run(built, recording, names, frames, interval, count, told)
-            recorded = recording.finish()
+            reports = _run(built, transfer, names, frames, interval, count, told)
+            stored = transfer.finish()
         except BaseException:
-            recording.abandon()
+            transfer.abandon()
             raise
         if _had_room(built):
-            return recorded, _failures(built, reports, interval / count, frames)
+            return stored, _failures(built, reports, interval / count, frames)
 
 
 def _run(
-    built: Built, recording: Recording, names: Sequence[str], frames: int, interval: float, count: int,
+    built: Built, transfer: FrameTransfer, names: Sequence[str], frames: int, interval: float, count: int,
     told: Told | None,
 ) -> Tensor:  # fmt: skip
     """Queue all frames; returns the results of reports, float64 [reports, 3, B] on the device."""
@@ -129,14 +129,14 @@ def _run(
             if state.x.is_cpu:
                 heap.trim()
         taken = _take_all([_field(built, state, name) for name in names], order)
-        recording.put(dict(zip(names, taken, strict=True)))
+        transfer.put(dict(zip(names, taken, strict=True)))
         if told is not None:
             told(frame)
     return torch.stack(reports)
 
 
 def step_ready(built: Built) -> State:
-    """First state, in a step without recorded failures."""
+    """First state, in a step without earlier failures."""
     built.step.reset()
     return built.step.prepare(built.state)
 

@@ -30,7 +30,7 @@ TASKS = 24
 
 
 @dataclass(frozen=True)
-class Recorded:
+class StoredFrames:
     """Fields [T, N, ...] of a scene, float32, each as an array or packed, and in the latter case sums of its motion."""
 
     arrays: dict[str, Array]
@@ -47,7 +47,7 @@ class _Slab:
     ready: torch.cuda.Event | None
 
 
-class Recording:
+class FrameTransfer:
     """Fields [T, N, ...] in float32 of each scene of a batch, filled frame by frame.
 
     On CUDA, and with an executor, frames are collected in slabs; on CUDA a separate stream copies these to pinned
@@ -96,7 +96,7 @@ class Recording:
         self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
         if self._stream is not None or executor is not None:
             self._jobs: queue.Queue[_Slab | None] = queue.Queue(maxsize=2)
-            self._thread = threading.Thread(target=self._work, name="torch_mpm recording", daemon=True)
+            self._thread = threading.Thread(target=self._work, name="torch_mpm frames", daemon=True)
             self._thread.start()
 
     def put(self, values: Mapping[str, Tensor]) -> None:
@@ -120,7 +120,7 @@ class Recording:
         if place == self._slab_frames - 1:
             self._send()
 
-    def finish(self) -> list[Recorded]:
+    def finish(self) -> list[StoredFrames]:
         """Wait for all frames; returns the data of each scene.
 
         Raises:
@@ -135,7 +135,7 @@ class Recording:
                 raise self._error
         motions = [None] * len(self._arrays) if self._motion is None else self._motion.of_scenes(self._ends)
         return [
-            Recorded(arrays, {name: packing.finish() for name, packing in packings.items()}, motion)
+            StoredFrames(arrays, {name: packing.finish() for name, packing in packings.items()}, motion)
             for arrays, packings, motion in zip(self._arrays, self._packings, motions, strict=True)
         ]
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from ..boundaries import Obstacle
 from ..scene import schema
 from ..scene.places import obstacle
-from .recording import Array
+from .frame_transfer import Array
 
 _OBSTACLE: TypeAdapter[Any] = TypeAdapter(schema.AnyObstacle)
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from ..boundaries import Obstacle
 from ..boundaries.motion import to_body
 from ..scene.places import obstacle
-from .recording import Array
+from .frame_transfer import Array
 from .statistics import BOUNDARY
 
 LAYER = 1.5

@@ -93,12 +93,12 @@ class OnlineStream(IterableDataset[Item]):
             raise RuntimeError("OnlineStream must be used without workers of a data loader; it has a thread of its own")
         failed = 0
         stream = torch.cuda.Stream(self.device) if self.device.type == "cuda" else None
-        with StoppableExecutor("torch_mpm online") as pool:
+        with StoppableExecutor("torch_mpm online") as executor:
             rounds: deque[Future[_Round]] = deque()
             try:
                 while True:
                     while len(rounds) <= self.ahead:
-                        rounds.append(pool.submit(self._simulated, self.round + len(rounds), stream))
+                        rounds.append(executor.submit(self._simulated, self.round + len(rounds), stream))
                     made = rounds.popleft().result()
                     places = self._places(made.scenes)
                     failed = 0 if places else failed + 1
@@ -110,7 +110,7 @@ class OnlineStream(IterableDataset[Item]):
                         yield from self._batches(made.arrived(), places)
                     self.round, self.taken = self.round + 1, 0
             finally:
-                pool.stop()
+                executor.stop()
 
     def state_dict(self) -> dict[str, int]:
         """Position of this stream; the round is simulated again after `load_state_dict`."""

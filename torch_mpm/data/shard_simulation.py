@@ -21,8 +21,8 @@ from ..scene.build import Built
 from . import batch, obstacle_particles
 from .configuration import Configuration
 from .distribution import Words, is_number
+from .frame_transfer import Array, StoredFrames
 from .packing import Compressed
-from .recording import Array, Recorded
 from .sampling import NoRoom, content
 from .statistics import Motion
 
@@ -193,7 +193,7 @@ def _attempt(
 
     packed, behind = [packers is not None] * len(outcomes), [o.behind for o in outcomes]
     try:
-        recorded, failures = batch.simulate(
+        stored, failures = batch.simulate(
             built, names, dataset.frames, dataset.interval, count, frame_told, packers, packed, behind
         )
     except torch.OutOfMemoryError as error:
@@ -207,7 +207,7 @@ def _attempt(
         if not failure:
             rows = slice(ends[index], ends[index + 1])
             own = {name: statics[name][rows].numpy() for name in ("mass", "volume", "material")}
-            _complete(configuration, outcome, recorded[index], own, built, index)
+            _complete(configuration, outcome, stored[index], own, built, index)
 
 
 def _parameters(
@@ -223,7 +223,7 @@ def _parameters(
 
 
 def _complete(
-    configuration: Configuration, outcome: Outcome, recorded: Recorded, own: dict[str, Array], built: Built,
+    configuration: Configuration, outcome: Outcome, stored: StoredFrames, own: dict[str, Array], built: Built,
     index: int,
 ) -> None:  # fmt: skip
     """Store the arrays of a valid scene: fields, types, materials and masses of its particles."""
@@ -235,7 +235,7 @@ def _complete(
         {"name": m.name, "particle_type": code, **m.words.model_dump(mode="json", exclude_none=True)}
         for m, code in zip(materials, types, strict=True)
     ]
-    outcome.packed, outcome.motion = recorded.packed, recorded.motion
+    outcome.packed, outcome.motion = stored.packed, stored.motion
     constant = {
         "particle_type": np.array(types, np.int8)[number],
         "material": number.astype(np.int8),
@@ -245,7 +245,7 @@ def _complete(
     }
     if outcome.behind:
         constant = {name: np.concatenate([values, outcome.behind[name]]) for name, values in constant.items()}
-    outcome.arrays = {**recorded.arrays, **constant}
+    outcome.arrays = {**stored.arrays, **constant}
 
 
 def _wants_obstacles(configuration: Configuration, outcome: Outcome) -> bool:

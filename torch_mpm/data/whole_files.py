@@ -150,5 +150,5 @@ def file_hash(path: Path) -> str:
                 left -= len(data)
         return digest.digest()
 
-    with ThreadPoolExecutor(min(len(os.sched_getaffinity(0)), MOST_HASHERS)) as pool:
-        return hashlib.sha256(b"".join(pool.map(part, range(0, path.stat().st_size, PART_BYTES)))).hexdigest()
+    with ThreadPoolExecutor(min(len(os.sched_getaffinity(0)), MOST_HASHERS)) as executor:
+        return hashlib.sha256(b"".join(executor.map(part, range(0, path.stat().st_size, PART_BYTES)))).hexdigest()

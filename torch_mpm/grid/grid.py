@@ -39,7 +39,7 @@ class _Pools(threading.local):
     def __init__(self) -> None:
         self.replayed: Iterator[int] | None = None
         self.before: dict[Grid, int | None] = {}
-        self.recordings: list[list[int]] = []
+        self.lists: list[list[int]] = []
 
 
 _POOLS = _Pools()
@@ -148,7 +148,7 @@ class Grid(Lattice):
         Raises:
             ValueError, TypeError: for wrong shapes, dtypes or devices.
             ValueError: where positions of this dtype do not resolve the cells (`check_resolution`).
-            GridOverflowError: on the CPU, where a fixed `max_blocks` is too small. On CUDA the status records it
+            GridOverflowError: on the CPU, where a fixed `max_blocks` is too small. On CUDA the status reports it
                 (`Step.check`).
         """
         check_positions(x, self.dim, scene, self.scenes)
@@ -197,7 +197,7 @@ class Grid(Lattice):
             self._grow(x, scene)
         assert self.max_blocks is not None
         if not compiling:
-            for sizes in _POOLS.recordings:
+            for sizes in _POOLS.lists:
                 sizes.append(self.max_blocks)
         return self.max_blocks
 
@@ -281,11 +281,11 @@ def same_pools(sizes: list[int]) -> Iterator[None]:
     Recomputed steps of the backward pass thus find pools of the original size.
     """
     if not sizes:
-        _POOLS.recordings.append(sizes)
+        _POOLS.lists.append(sizes)
         try:
             yield
         finally:
-            _POOLS.recordings.pop()
+            _POOLS.lists.pop()
         return
     outer, before = _POOLS.replayed, _POOLS.before
     _POOLS.replayed, _POOLS.before = iter(sizes), {}
@@ -299,13 +299,13 @@ def same_pools(sizes: list[int]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def own_pools() -> Iterator[None]:
-    """Context in which an enclosing `same_pools` neither records nor sets the sizes of pools."""
-    replayed, recordings = _POOLS.replayed, _POOLS.recordings
-    _POOLS.replayed, _POOLS.recordings = None, []
+    """Context in which an enclosing `same_pools` neither stores nor sets the sizes of pools."""
+    replayed, lists = _POOLS.replayed, _POOLS.lists
+    _POOLS.replayed, _POOLS.lists = None, []
     try:
         yield
     finally:
-        _POOLS.replayed, _POOLS.recordings = replayed, recordings
+        _POOLS.replayed, _POOLS.lists = replayed, lists
 
 
 def _check_status(status: Any, scenes: int) -> None:

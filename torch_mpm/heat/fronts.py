@@ -19,7 +19,7 @@ LAG, LEAST_LAG = 0.45, 0.1
 """
 
 
-class FrontRecord:
+class FrontStatus:
     """Largest diffusion number so far, r = κ dt/(ρ C dx²), of particles that changed their liquid fraction.
 
     Attributes:
@@ -70,11 +70,11 @@ class FrontRecord:
             )
 
     def reset(self) -> None:
-        """Discard the record."""
+        """Discard the status."""
         if self.largest is not None:
             self.largest.zero_()
 
     def forget(self, scenes: Tensor) -> None:
-        """Discard the record of scenes, bool [B]."""
+        """Discard the status of scenes, bool [B]."""
         if self.largest is not None:
             self.largest.masked_fill_(scenes, 0)

@@ -44,9 +44,9 @@ from ..state.state import State, check_state
 from ..step.clocks import time_after
 from ..step.failures import Failures, Problem, raise_failures, unsolved_heat
 from ..step.pause import paused
-from ..step.status import ActivationRecord
+from ..step.status import ErrorStatus
 from .boundaries import FixedSurface, HeatNodes
-from .fronts import FrontRecord
+from .fronts import FrontStatus
 
 TRANSFERS = ("hybrid", "apic", "flip", "pic")
 NEGLIGIBLE = 1e-12
@@ -144,11 +144,11 @@ class Heat(nn.Module):
             check_value("melting_point", melting_point, "a number", lambda v: v == v, infinite=True)
             store(self, "melting_point", melting_point)
             store(self, "latent_heat", check_value("latent_heat", latent_heat, "positive", positive))
-        self._activations = ActivationRecord()
+        self._error_status = ErrorStatus()
         self.unsolved: Tensor | None = None
         """Solves of each scene so far that missed their tolerance, int32 [B], and the largest residual [B] [K]."""
         self.residual: Tensor | None = None
-        self.fronts = FrontRecord()
+        self.fronts = FrontStatus()
 
     def __setattr__(self, name: str, value: Any) -> None:
         super().__setattr__(name, BoundaryList(value) if name == "boundaries" else value)
@@ -156,7 +156,7 @@ class Heat(nn.Module):
     @property
     def status(self) -> Tensor | None:
         """Status of the activations of `forward`, as `Step.status`."""
-        return self._activations.status
+        return self._error_status.status
 
     @property
     def affine(self) -> bool:
@@ -198,13 +198,13 @@ class Heat(nn.Module):
         """
         state = self.prepare(state)
         if torch.compiler.is_compiling():
-            return paused(self._advanced, self._activations, state, dt, self.grid.scenes)
+            return paused(self._advanced, self._error_status, state, dt, self.grid.scenes)
         with control_step(self, state, 1, dt) as left:
-            return left(paused(self._advanced, self._activations, state, dt, self.grid.scenes))
+            return left(paused(self._advanced, self._error_status, state, dt, self.grid.scenes))
 
     def _advanced(self, state: State, dt: float | Tensor) -> State:
         """Prepared state one step later."""
-        blocks = self._activations.activate(self.grid, state.x, state.scene, state.ids)
+        blocks = self._error_status.activate(self.grid, state.x, state.scene, state.ids)
         return state.replace(**self.update(blocks, state, dt), time=time_after(state.time, dt))
 
     def update(
@@ -282,7 +282,7 @@ class Heat(nn.Module):
         solved = solve.converged
         if isinstance(dt, Tensor):
             solved = solved | (dt.detach() == 0)  # A paused scene has nothing to solve.
-        self._record(solved, solve.residual)
+        self._store(solved, solve.residual)
         return solve.increment if start is nodes.theta else solve.increment + (start - nodes.theta)
 
     def _to_particles(
@@ -356,7 +356,7 @@ class Heat(nn.Module):
         return state.mass * content
 
     @torch.no_grad()
-    def _record(self, converged: Tensor, residual: Tensor) -> None:
+    def _store(self, converged: Tensor, residual: Tensor) -> None:
         """Store the values that `check` reports, on the device."""
         converged, residual = without_transforms(converged), without_transforms(residual)
         with outside_transforms():
@@ -386,21 +386,21 @@ class Heat(nn.Module):
         """
         if self.unsolved is None:
             return
-        problems = self._activations.problems(self.grid) | self.problems()
-        raise_failures(Failures.of(problems, self.grid.scenes), self._activations.all(), self.grid)
+        problems = self._error_status.problems(self.grid) | self.problems()
+        raise_failures(Failures.of(problems, self.grid.scenes), self._error_status.all(), self.grid)
         self.fronts.warn()
 
     def reset(self) -> None:
-        """Discard the record of the solves so far."""
-        self._activations.reset()
+        """Discard the status of the solves so far."""
+        self._error_status.reset()
         self.fronts.reset()
         for kept in (self.unsolved, self.residual):
             if kept is not None:  # CUDA graphs may write to it.
                 kept.zero_()
 
     def forget(self, scenes: Tensor) -> None:
-        """Discard the record of scenes, bool [B] on the device of the particles."""
-        self._activations.forget(scenes)
+        """Discard the status of scenes, bool [B] on the device of the particles."""
+        self._error_status.forget(scenes)
         self.fronts.forget(scenes)
         for kept in (self.unsolved, self.residual):
             if kept is not None:

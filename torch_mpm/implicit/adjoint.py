@@ -77,7 +77,7 @@ class _Solution(torch.autograd.Function):
         adjoint, converged = solve.solve(grad)
         if holds is not None:
             adjoint = adjoint + solve.held(grad, adjoint, holds)
-        ctx.owner.record_adjoint(converged)
+        ctx.owner.store_adjoint(converged)
         adjoint = torch.where(system.of_nodes(converged), adjoint, torch.nan)
         return -adjoint, None, None, None, *(None for _ in tensors)
 

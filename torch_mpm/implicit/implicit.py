@@ -155,7 +155,7 @@ class Implicit:
             fixed = system.detached() if wants_gradient else system
             minimum = minimise(fixed, bounds, self.options)
             fixed.forget()
-        self._record(minimum)
+        self._store(minimum)
         v = differentiable(self, system, fixed, bounds, minimum) if wants_gradient else minimum.v
         if not counts:
             return v, None
@@ -180,13 +180,13 @@ class Implicit:
         assert isinstance(law, Mixture)
         return stress.index_fill(0, law.particles_of(state, solved_materials(law, self.explicit)), 0)
 
-    def record_adjoint(self, converged: Tensor) -> None:
-        """Record one solve of a backward pass, bool [B]."""
+    def store_adjoint(self, converged: Tensor) -> None:
+        """Store the convergence of one solve of a backward pass, bool [B]."""
         kept = None if self._adjoint_begins else self.adjoint_converged
         self.adjoint_converged = converged if kept is None else kept & converged
         self._adjoint_begins = False
 
-    def _record(self, minimum: Minimum) -> None:
+    def _store(self, minimum: Minimum) -> None:
         if torch._C._current_graph_task_id() == -1:  # Not recomputed in a backward pass.
             self._adjoint_begins = True
         self.report = ImplicitReport(minimum.converged, minimum.residual, minimum.iterations, minimum.cg_iterations)
@@ -206,18 +206,18 @@ class Implicit:
         return unsolved_steps(self._unsolved, self._residual)
 
     def fresh(self) -> Implicit:
-        """Copy without records."""
+        """Copy without the status of its steps."""
         result = copy.copy(self)
         result.options = dataclasses.replace(self.options)
         result.reset()
         return result
 
     def reset(self) -> None:
-        """Discard the records of the steps so far."""
+        """Discard the status of the steps so far."""
         self.report = self._unsolved = self._residual = self.adjoint_converged = None
 
     def forget(self, scenes: Tensor) -> None:
-        """Discard the records of scenes, bool [B]."""
+        """Discard the status of scenes, bool [B]."""
         for kept in (self._unsolved, self._residual):
             if kept is not None:
                 kept.masked_fill_(scenes, 0)
@@ -258,7 +258,7 @@ INTEGRATORS = ("explicit", "implicit")
 
 
 def as_integrator(value: Any) -> Implicit | None:
-    """Integrator of a step, a copy without records; None for the explicit one.
+    """Integrator of a step, a copy without the status of its steps; None for the explicit one.
 
     Raises:
         TypeError, ValueError: for an invalid integrator.

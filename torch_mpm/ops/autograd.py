@@ -1,4 +1,4 @@
-"""Recording of an op by autograd with little work for the host, which would exceed that of a small scene's kernels."""
+"""Tracking of an op by autograd with little work for the host, which would exceed that of a small scene's kernels."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ def dispatch(op: Any, *arguments: Any) -> Any:
     return op(*arguments) if _is_differentiated(*arguments) else _below_autograd(op, arguments)
 
 
-def is_recorded(*tensors: torch.Tensor) -> bool:
-    """Whether a call is recorded, transformed or compiled."""
+def is_tracked(*tensors: torch.Tensor) -> bool:
+    """Whether a call is differentiated, transformed or compiled."""
     return _is_differentiated(*tensors) or _transformed()
 
 
 def _is_differentiated(*arguments: Any) -> bool:
-    """Whether a call is recorded or has a tangent, or this is unknown yet."""
+    """Whether autograd tracks a call or it has a tangent, or this is unknown yet."""
     return (
         torch.compiler.is_compiling()
         or forward_ad._current_level >= 0
@@ -41,7 +41,7 @@ def _below_autograd(op: Any, arguments: Sequence[Any]) -> Any:
 
 
 def graph_at_once() -> saved_tensors_hooks:
-    """Context in which a graph is recorded and differentiated at once: without the hooks of checkpoints, which would
+    """Context in which a graph is built and differentiated at once: without the hooks of checkpoints, which would
     recompute their steps for it, and those that move tensors to the host.
     """
     return saved_tensors_hooks(_same, _same)
@@ -89,7 +89,7 @@ def register_autograd(
     methods = {"forward": staticmethod(forward), "backward": staticmethod(nested_backward)}
     function: Any = type(f"torch_mpm_{name}", (torch.autograd.Function,), methods)  # Name of the node in graphs.
     # `Function.apply` handles the levels of torch.func first; the dispatcher has done so where it calls `kernel`.
-    record = super(torch.autograd.Function, function).apply
+    apply = super(torch.autograd.Function, function).apply
 
     def kernel(*given: Any) -> Any:
         arguments = (*given, *defaults[len(given) :])
@@ -100,8 +100,8 @@ def register_autograd(
         flat = [len(arguments[i]) for i in lists], *_flat(arguments, lists)
         if _transformed():
             with enable_single_level_autograd_function():
-                return record(*flat)
-        return record(*flat)
+                return apply(*flat)
+        return apply(*flat)
 
     _LIBRARY.impl(name, kernel, "Autograd")
 
@@ -124,7 +124,7 @@ def saved_with_topology(ctx: Any) -> tuple[list[Any], PackedTopology]:
 
 
 def _for_outer_levels(op: Any, arguments: Sequence[Any]) -> Any:
-    """Below autograd come the outer levels of torch.func, which record too: `Function.forward` disables that."""
+    """Below autograd come the outer levels of torch.func, which differentiate too: `Function.forward` disables that."""
     with torch.enable_grad(), forward_ad._set_fwd_grad_enabled(True):
         return _below_autograd(op, arguments)
 

@@ -29,8 +29,8 @@ def refine(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Iterative refinement (Wilkinson 1963), with dt and tolerance per scene [B].
 
-    `solve(r)` returns the increment of a right side in float32. Only the last correction is recorded by autograd: its
-    right side is zero to rounding, but depends on every input as the residual does, so that one adjoint solve remains.
+    `solve(r)` returns the increment of a right side in float32. Autograd tracks only the last correction: its right
+    side is zero to rounding, but depends on every input as the residual does, so that one adjoint solve remains.
 
     Returns:
         increment in float64 [N], iterations, residual and converged [B].

@@ -13,7 +13,7 @@ from .. import _library
 from ..cuda_graphs.capture import is_traced
 from ..errors import FLOATING
 from .arguments import refuse_vmap, soa_empty
-from .autograd import dispatch, is_recorded, register_autograd
+from .autograd import dispatch, is_tracked, register_autograd
 
 Places = list[int]
 
@@ -46,10 +46,10 @@ FUNCTIONS: dict[str, Function] = _read()
 
 def fuses(*tensors: Tensor) -> bool:
     """Whether `pointwise` may replace torch operations, which have all derivatives and transforms: where nothing is
-    recorded, transformed or compiled, and all tensors are float32, or all float64.
+    differentiated, transformed or compiled, and all tensors are float32, or all float64.
     """
     return not (
-        is_recorded(*tensors) or tensors[0].dtype not in FLOATING or any(t.dtype != tensors[0].dtype for t in tensors)
+        is_tracked(*tensors) or tensors[0].dtype not in FLOATING or any(t.dtype != tensors[0].dtype for t in tensors)
     )
 
 

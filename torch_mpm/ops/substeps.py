@@ -18,7 +18,7 @@ for each law. The time step dt [s] is one of the parameters of rate-dependent la
 where it is given. With `flip` that share of the velocities of particles, minus those of the nodes before the forces, is
 added to the result of G2P. Scenes with separate clocks have the time steps dt times `scene_dt` and begin at
 `scene_time`, both [B], the latter in float64. With `grows` the pool grows with the scene on the CPU; otherwise the op
-stops on the CPU where it is full, and the status records it. On CUDA the host waits only to stay less than a fraction
+stops on the CPU where it is full, and the status reports it. On CUDA the host waits only to stay less than a fraction
 of a second ahead of the device. With `resident` batches of small scenes may be computed on CUDA by one thread block per
 scene; sums, also those of gradients, may then round differently. With `records` all inputs of the adjoint are stored in
 `record`, opaque bytes, and no step is recomputed, except where impulses are counted or the pool had to grow. `residual`

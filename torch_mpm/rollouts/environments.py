@@ -215,7 +215,7 @@ class Environments:
         self._begin_anew(mask)
 
     def _begin_anew(self, mask: Tensor) -> None:
-        """Clocks, impulses and records of scenes."""
+        """Clocks, impulses and status of scenes."""
         self.time = torch.where(mask, 0.0, self.time)
         self.frozen = self.frozen & ~mask
         self.state = self.state.with_poses({key: left.without(mask) for key, left in self.state.poses.items()})

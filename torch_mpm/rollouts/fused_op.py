@@ -89,7 +89,7 @@ def substeps(
     def advanced(state: State, dt: float | Tensor) -> State:
         return _substeps(step, state, n, dt, records, blocks, schedule)
 
-    return paused(advanced, step._activations, step.prepare(state), dt, step.grid.scenes, n)
+    return paused(advanced, step._error_status, step.prepare(state), dt, step.grid.scenes, n)
 
 
 def substeps_arguments(
@@ -146,7 +146,7 @@ def _arguments(
     arguments = (
         *(state.x, state.v, state.mass, state.volume, state.C, state.F, state.J),
         None if state.x_residual is None else state.x_residual.detach(),
-        *(calls.history, state.scene, state.ids, calls.material, step._activations.status_for(state.x)),
+        *(calls.history, state.scene, state.ids, calls.material, step._error_status.status_for(state.x)),
         *(calls.names, calls.options, calls.parameters, calls.variables),
         *(int(n), number, apic, step._flip_share, apic or law.viscous, STRESS_FORMS[step.stress_form]),
         _gravity(step, state.x),
@@ -164,13 +164,13 @@ def _substeps(
     step: Step, state: State, n: int, dt: float | Tensor, records: bool, blocks: int | None, schedule: str | None
 ) -> State:
     """`substeps` of a prepared state, where no scene is paused."""
-    grid, record = step.grid, step._activations
-    record.begin(state, grid.scenes)
+    grid, errors = step.grid, step._error_status
+    errors.begin(state, grid.scenes)
     arguments, history_names = _arguments(step, state, n, dt, records, blocks, schedule)
     x, v, C, F, J, history, status, impulse, time, residual, _ = interruptible(
         dispatch, torch.ops.torch_mpm.substeps, *arguments
     )
-    record.follow(record.status, status)
+    errors.follow(errors.status, status)
     grid.watch(status)
     if status.device.type == "cpu":  # where the op has let the pool grow, or stopped
         grid.follow(status[0].tolist()[Status.BLOCKS_WANTED if grid.grows else Status.BLOCKS_NOW])

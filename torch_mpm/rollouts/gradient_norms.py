@@ -18,13 +18,13 @@ MOVED = ("x", "v", "C", "F", "J", "temperature")
 
 
 class GradientNorms:
-    """Record of the gradient of the loss by the states of a rollout: `rollout(..., norms=GradientNorms())`.
+    """Norms of the gradient of the loss by the states of a rollout: `rollout(..., norms=GradientNorms())`.
 
     Args:
-        every: steps between two recorded states. A rollout stores every recorded state.
+        every: steps between two states with a norm. A rollout stores each of these states.
 
-    The backward pass fills it, without waiting for the device; the next rollout with it starts a new record. A norm is
-    NaN for fields that need no gradient, zero for those without one, and infinite for a gradient that is not finite.
+    The backward pass fills it, without waiting for the device; the next rollout with it starts anew. A norm is NaN
+    for fields that need no gradient, zero for those without one, and infinite for a gradient that is not finite.
 
     Raises:
         TypeError, ValueError: unless `every` is a positive integer.
@@ -40,14 +40,14 @@ class GradientNorms:
     # ---- in a rollout
 
     def points(self, first: int, n: int) -> list[int]:
-        """Steps whose states are recorded, and n for the end."""
+        """Numbers of steps before the states with a norm, and n for the end."""
         return [*range(first, n, self.every), n]
 
     def start(self, steps: Sequence[int], scenes: int, dx: float, dt: float | Tensor) -> None:
-        """Start a record.
+        """Start anew.
 
         Args:
-            steps: numbers of steps before the recorded states.
+            steps: numbers of steps before the states with a norm.
             scenes: B.
             dx: node distance [m].
             dt: time step [s].
@@ -61,7 +61,7 @@ class GradientNorms:
         self._units = {"x": dx, "v": dx * rate, "C": rate}
 
     def watched(self, state: State, k: int) -> State:
-        """The same state, whose gradients are recorded as those before step k."""
+        """The same state, with hooks that store the norms of its gradients as those before step k."""
         row, scene = self._steps.index(k), state.scene
 
         def watch(name: str, t: Tensor) -> Tensor:
@@ -74,7 +74,7 @@ class GradientNorms:
             norms[row] = 0
 
             @torch.no_grad()
-            def record(grad: Tensor | None) -> None:
+            def store_norm(grad: Tensor | None) -> None:
                 if grad is None:  # An output without a gradient among others with one.
                     return
                 squares = grad.double().square().reshape(len(grad), math.prod(grad.shape[1:])).sum(1)
@@ -83,7 +83,7 @@ class GradientNorms:
             # A user's tensor, which would keep the hooks and may be used elsewhere.
             if t.is_leaf or k == self._steps[0]:
                 t = t.view_as(t)
-            t.register_hook(record)
+            t.register_hook(store_norm)
             return t
 
         changes = {name: watch(name, t) for name in MOVED if (t := getattr(state, name)) is not None}
@@ -94,7 +94,7 @@ class GradientNorms:
 
     @property
     def steps(self) -> list[int]:
-        """Numbers of steps before the recorded states, [K]."""
+        """Numbers of steps before the states with a norm, [K]."""
         return self._steps
 
     @property
@@ -123,8 +123,8 @@ class GradientNorms:
                 smaller by this factor contribute nothing.
 
         Returns:
-            Number of steps back from the end to the first such state in any scene, at least 1; None where all recorded
-            gradients are within the bounds. Synchronises.
+            Number of steps back from the end to the first such state in any scene, at least 1; None where all norms
+            are within the bounds. Synchronises.
 
         Raises:
             ValueError: for a `growth` of 1 or less, or before a backward pass.

@@ -46,7 +46,7 @@ def replay_all(step: Step, function: Callable[[State], State], state: State, tim
     before."""
     graph: Replays | None = None
     in_flight = WorkInFlight(state.x)
-    with step._activations.passing_graphs():
+    with step._error_status.passing_graphs():
         while times > 0:
             count = min(times, most) if step.grid.grows else times
             step.grid.wait()

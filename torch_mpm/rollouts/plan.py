@@ -35,7 +35,7 @@ from ..ops.contact import MAX_OBSTACLES, fusible
 from ..ops.obstacle_tables import numbers_of_a_step, path_requires_grad
 from ..state.state import State, check_state, tensors_of
 from ..step.clocks import StepTimes, requires_grad
-from ..step.status import ActivationRecord
+from ..step.status import ErrorStatus
 from ..step.step import Step
 from . import graph_segments
 from .anomaly import detecting
@@ -381,7 +381,7 @@ def _why_not_graphs(steps: Steps, state: State) -> str | None:
     return "there are no particles" if len(state) == 0 else None
 
 
-_OWN = (DeviceConstantCache, CapturedGraphs, ActivationRecord, Grid)
+_OWN = (DeviceConstantCache, CapturedGraphs, ErrorStatus, Grid)
 """Made for graphs."""
 
 

@@ -57,7 +57,7 @@ def rollout(
         hook: called as `hook(state, k)` before step k = 0, every, 2 every, ...; it may read the state, add to a loss,
             or return another state with as many particles. The state at each call is stored.
         every: number of steps between two calls of the hook.
-        norms: records the norm of the gradient at states on the way; see `GradientNorms`.
+        norms: stores the norm of the gradient at states on the way; see `GradientNorms`.
         graph: number of steps per CUDA graph, for steps that the fused op does not support, user functions included;
             a second graph computes their gradients. It pays for networks in a step, where launching the kernels takes
             longer than running them. The state is stored every `graph` steps, and the backward pass recomputes the

@@ -191,7 +191,7 @@ class Clocks:
             state, dt = self._next(state, n)
             return in_calls(Steps(self.step, n, dt), state, plan)
 
-        # The first one allocates the records of steps.
+        # The first one allocates the status of steps.
         self.state = replay_all(self.step, segment, segment(self.state), segments - 1, max(CHUNK // n, 1))
 
     def finish(self, counts: list[int], options: dict[str, Any]) -> None:

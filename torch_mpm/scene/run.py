@@ -552,7 +552,7 @@ def on_host(tensors: Mapping[str, Tensor]) -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Versions that are recorded in a trajectory."""
+    """Versions that a trajectory stores."""
     try:
         own = metadata.version("torch-mpm")
     except metadata.PackageNotFoundError:

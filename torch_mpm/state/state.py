@@ -29,7 +29,7 @@ from ..errors import (
 from ..geometry.seed import Points
 from ..grid.grid import Grid, check_grid
 from ..ops.arguments import refuse_batched, scenes_up_to, soa_empty
-from ..ops.autograd import dispatch, is_recorded
+from ..ops.autograd import dispatch, is_tracked
 
 if TYPE_CHECKING:
     from ..boundaries.control import Poses
@@ -376,7 +376,7 @@ class State:
         return self.map(lambda t: _take(t, particles))
 
     def sorted(self, grid: Grid) -> State:
-        """Reorder by grid block and cell: neighbours in space become neighbours in memory. `ids` record the original
+        """Reorder by grid block and cell: neighbours in space become neighbours in memory. `ids` store the original
         order.
 
         Occasional reordering keeps long simulations fast; results differ only by rounding. Differentiable.
@@ -707,7 +707,7 @@ def _take(t: Tensor, particles: Tensor) -> Tensor:
 
 def _take_all(fields: Sequence[Tensor], particles: Tensor) -> list[Tensor]:
     """Rows of many tensors in one call, for particles that are known to exist."""
-    if is_recorded(*fields) or any(t.element_size() > 8 or t.layout != torch.strided for t in fields):
+    if is_tracked(*fields) or any(t.element_size() > 8 or t.layout != torch.strided for t in fields):
         return [_take(t, particles) for t in fields]
     taken: list[Tensor] = dispatch(torch.ops.torch_mpm.take, fields, particles)
     return taken

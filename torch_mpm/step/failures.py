@@ -1,4 +1,4 @@
-"""Failures of scenes: recorded on the device without waiting for it, and described in words."""
+"""Failures of scenes: counted on the device without waiting for it, and described in words."""
 
 from __future__ import annotations
 
@@ -285,7 +285,7 @@ def unsolved_steps(unsolved: Tensor, residual: Tensor) -> dict[str, Problem]:
 def _full_grid(grid: Grid, peak: int, when: str, comes_first: bool) -> str:
     """Sentence about a grid with too few blocks for the largest number of active blocks, `peak`; "" otherwise.
 
-    A pool that grows may be larger by now: then the status alone records it, if this `comes_first` of all problems.
+    A pool that grows may be larger by now: then the status alone reports it, if this `comes_first` of all problems.
     """
     if grid.grows and comes_first:
         return (

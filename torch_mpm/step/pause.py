@@ -11,28 +11,28 @@ from torch import Tensor
 from ..cuda_graphs.capture import is_traced
 from ..ops.arguments import per_particle, split_dt
 from ..state.state import PARTICLE_FIELDS, State
-from .status import ActivationRecord
+from .status import ErrorStatus
 
 
 def paused(
     advanced: Callable[[State, float | Tensor], State],
-    record: ActivationRecord,
+    status: ErrorStatus,
     state: State,
     dt: float | Tensor,
     scenes: int,
     steps: int = 1,
 ) -> State:
-    """`advanced(state, dt)` with scenes paused by a tensor dt; `record` counts its invalid entries, once for each of
+    """`advanced(state, dt)` with scenes paused by a tensor dt; `status` counts its invalid entries, once for each of
     the steps that `advanced` computes.
     """
     if not isinstance(dt, Tensor):
         return advanced(state, dt)
     split_dt(dt, scenes, state.x)  # checks dt
     if _all_move(dt):
-        record.counts(scenes, dt.device)  # A compiled step then finds it.
+        status.counts(scenes, dt.device)  # A compiled step then finds it.
         return advanced(state, dt)
     dt, moving, refused = split_paused(dt, state, scenes)
-    record.refuse(refused, scenes, steps)
+    status.refuse(refused, scenes, steps)
     after = standing(state, advanced(state, dt), moving)
     if after.impulse is None or state.impulse is None:
         return after

@@ -31,8 +31,8 @@ NO_PROBLEM = tuple(-1 if column in FIRST_PROBLEMS else 0 for column in Status)
 """Row of the status before the first activation (csrc/grid/status.h)."""
 
 
-class ActivationRecord:
-    """Status of all activations of one user of a grid, including those replayed by CUDA graphs.
+class ErrorStatus:
+    """Errors of all activations of one user of a grid, including those replayed by CUDA graphs.
 
     A replay reads and writes the tensors of the capture. Captured activations therefore continue in the tensor that
     they found, which is stored. The first activation of all should not be captured: otherwise each replay discards
@@ -89,7 +89,7 @@ class ActivationRecord:
 
     @contextlib.contextmanager
     def passing_graphs(self) -> Iterator[None]:
-        """Graphs captured inside are not replayed afterwards: the record keeps the latest status only."""
+        """Graphs captured inside are not replayed afterwards: only the latest status is stored."""
         known = list(self._replayed)
         try:
             yield
@@ -160,23 +160,23 @@ class ActivationRecord:
                     status[0, column].masked_fill_(scenes.any(), -1)
 
 
-RECORDS = ("_activations", "unsolved", "residual", "_unsolved", "_residual", "report", "adjoint_converged")
-"""Attributes in which steps, heat and integrators record results."""
+STORED = ("_error_status", "unsolved", "residual", "_unsolved", "_residual", "report", "adjoint_converged")
+"""Attributes in which steps, heat and integrators store their status."""
 
 
 @contextlib.contextmanager
 def aside(step: Any, x: Tensor) -> Iterator[None]:
-    """Context in which steps leave no trace: neither in their records nor in the random number generators.
+    """Context in which steps leave no trace: neither in their status nor in the random number generators.
 
     Args:
-        step: a module, including its parts, or a function, which has no records.
+        step: a module, including its parts, or a function, which has no status.
         x: a tensor on the device of the particles.
     """
-    modules = _recorders(step) if isinstance(step, torch.nn.Module) else []
+    modules = _with_status(step) if isinstance(step, torch.nn.Module) else []
     integrators = [i for m in modules if (i := getattr(m, "integrator", None)) is not None]
-    kept = [(m, name, getattr(m, name)) for m in (*modules, *integrators) for name in RECORDS if hasattr(m, name)]
+    kept = [(m, name, getattr(m, name)) for m in (*modules, *integrators) for name in STORED if hasattr(m, name)]
     for owner, name, _ in kept:
-        setattr(owner, name, ActivationRecord() if name == "_activations" else None)
+        setattr(owner, name, ErrorStatus() if name == "_error_status" else None)
     try:
         with torch.random.fork_rng([x.device] if x.is_cuda else []):
             yield
@@ -189,25 +189,25 @@ COUNTS = ("unsolved", "residual")
 """Attributes of heat that its steps add to."""
 
 
-def _recorders(step: torch.nn.Module) -> list[Any]:
-    return [m for m in step.modules() if hasattr(m, "_activations")]
+def _with_status(step: torch.nn.Module) -> list[Any]:
+    return [m for m in step.modules() if hasattr(m, "_error_status")]
 
 
 def counts_of(step: torch.nn.Module) -> list[tuple[Any, str, Tensor | None]]:
-    """Storage of the records of explicit steps: owner, attribute and tensor."""
-    modules = _recorders(step)
-    places: list[tuple[Any, str]] = [(m._activations, name) for m in modules for name in ("status", "refused")]
+    """Storage of the status of explicit steps: owner, attribute and tensor."""
+    modules = _with_status(step)
+    places: list[tuple[Any, str]] = [(m._error_status, name) for m in modules for name in ("status", "refused")]
     places += [(m, name) for m in modules for name in COUNTS if hasattr(m, name)]
     return [(owner, name, getattr(owner, name)) for owner, name in places]
 
 
 @contextlib.contextmanager
 def uncounted(step: torch.nn.Module) -> Iterator[None]:
-    """Context in which explicit steps leave no trace in their records. Unlike after `aside`, the tensors of the records
+    """Context in which explicit steps leave no trace in their status. Unlike after `aside`, the tensors of the status
     exist afterwards, and the steps of graphs continue in them.
     """
     tensors = counts_of(step)
-    written = [t for m in _recorders(step) for t in m._activations._replayed] + buffers_of_users(step)
+    written = [t for m in _with_status(step) for t in m._error_status._replayed] + buffers_of_users(step)
     with torch.inference_mode(), outside_transforms():
         before = [None if t is None else t.clone() for _, _, t in tensors]
         replayed = [(t, t.clone()) for t in written]

@@ -39,7 +39,7 @@ from .failures import Failures, problems_of_state, raise_failures
 from .particle_operations import ParticleOperation, operated
 from .pause import paused, standing
 from .stability import LawDiagnostics, chosen_dt, law_diagnostics, stability_report
-from .status import ActivationRecord
+from .status import ErrorStatus
 
 TRANSFERS = ("apic", "pic", "flip")
 
@@ -139,7 +139,7 @@ class Step(TensorModule):
         self.on_particles = on_particles
         self.integrator = integrator  # type: ignore[assignment]
         self.compensated = compensated
-        self._activations = ActivationRecord()
+        self._error_status = ErrorStatus()
         self._kept_gravity = DeviceConstantCache()
         locking.warn(self.law, self.grid.kernel, devices=False)
 
@@ -187,9 +187,9 @@ class Step(TensorModule):
         """
         state = self.with_residual(self.prepare(state), dt)
         if torch.compiler.is_compiling():
-            return paused(self._advanced, self._activations, state, dt, self.grid.scenes)
+            return paused(self._advanced, self._error_status, state, dt, self.grid.scenes)
         with control_step(self, state, 1, dt) as left:
-            return left(paused(self._advanced, self._activations, state, dt, self.grid.scenes))
+            return left(paused(self._advanced, self._error_status, state, dt, self.grid.scenes))
 
     def _advanced(self, state: State, dt: float | Tensor) -> State:
         """A prepared state one step later."""
@@ -208,8 +208,8 @@ class Step(TensorModule):
         """A prepared state one step later, without `on_particles`."""
         grid, law, scene = self.grid, self.law, state.scene
         law.check_parameters(len(state), grid.scenes)
-        self._activations.begin(state, grid.scenes)
-        blocks = self._activations.activate(grid, state.x, scene, state.ids)
+        self._error_status.begin(state, grid.scenes)
+        blocks = self._error_status.activate(grid, state.x, scene, state.ids)
         form, affine = self.stress_form, state.C if self.transfer == "apic" else None
         fields, stress = law(Overlay(state, dt=dt) if self._rate_dependent else state)
         stress = from_half(stress, state.x)
@@ -510,7 +510,7 @@ class Step(TensorModule):
     @property
     def status(self) -> Tensor | None:
         """Status of all steps so far, int32 [1 + B, 8] on the device of the particles, see csrc/grid/status.h."""
-        return self._activations.status
+        return self._error_status.status
 
     @torch.no_grad()
     def failures(self, state: State | None = None) -> Failures:
@@ -522,7 +522,7 @@ class Step(TensorModule):
         Args:
             state: its masses, volumes, velocities and deformations are checked too.
         """
-        problems = self._activations.problems(self.grid)
+        problems = self._error_status.problems(self.grid)
         if self.heat is not None:
             problems |= self.heat.problems()
         if self.integrator is not None:
@@ -530,7 +530,7 @@ class Step(TensorModule):
         if state is not None:
             taken = self.status is not None
             problems |= problems_of_state(self.law, self.prepare(state), self.grid.scenes, taken)
-        return Failures.of(problems, self.grid.scenes, self._activations.given)
+        return Failures.of(problems, self.grid.scenes, self._error_status.given)
 
     def check(self, state: State | None = None) -> None:
         """Check the status of all steps so far, and a state if given; synchronises with the device.
@@ -551,7 +551,7 @@ class Step(TensorModule):
                 from then on.
             GridOverflowError: if more blocks were active than the grid has room for, and nothing else is wrong.
         """
-        raise_failures(self.failures(state), self._activations.all(), self.grid)
+        raise_failures(self.failures(state), self._error_status.all(), self.grid)
         if self.heat is not None:
             self.heat.fronts.warn()
         locking.warn(self.law, self.grid.kernel)
@@ -583,7 +583,7 @@ class Step(TensorModule):
 
     def reset(self) -> None:
         """Forget the status of the steps so far."""
-        self._activations.reset()
+        self._error_status.reset()
         if self.heat is not None:
             self.heat.reset()
         if self.integrator is not None:
@@ -591,7 +591,7 @@ class Step(TensorModule):
 
     def forget_failures(self, scenes: Tensor) -> None:
         """Forget the problems of scenes, bool [B] on the device of the particles, without waiting for it."""
-        self._activations.forget(scenes)
+        self._error_status.forget(scenes)
         if self.heat is not None:
             self.heat.forget(scenes)
         if self.integrator is not None:

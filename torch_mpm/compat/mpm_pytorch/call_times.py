@@ -33,7 +33,7 @@ class CallTimes:
         self._entries: dict[int, tuple[StorageWeakRef, int, frozenset[Moment]]] = {}
         self._limit = LEAST_ENTRIES
 
-    def record(self, tensors: Iterable[Tensor], moment: Moment) -> None:
+    def store(self, tensors: Iterable[Tensor], moment: Moment) -> None:
         """Store the moment of a call that has these arguments."""
         for t in tensors:
             if not _has_storage(t):

@@ -134,7 +134,7 @@ class MPMSolver:
         else:
             check_number("time", time)
         if not recomputed:
-            self._times.record((x, v, C, F), (time, self._changes))
+            self._times.store((x, v, C, F), (time, self._changes))
             self.time = time + self.dt
         self.displacement = None
         volume = self._volume.to(x)
@@ -146,7 +146,7 @@ class MPMSolver:
         after = clamped(after, self.clip_bound, 1 - self.clip_bound)
         result = after, state.v, state.C, clamped(state.F, -LARGEST_ENTRY, LARGEST_ENTRY)
         if recomputed:
-            self._times.record(result, (time + self.dt, self._changes))
+            self._times.store(result, (time + self.dt, self._changes))
         return result
 
     def _recomputed_time(self, arguments: tuple[Tensor, ...]) -> float:
