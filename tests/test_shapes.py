@@ -2,6 +2,7 @@
 
 import math
 import textwrap
+import types
 
 import numpy as np
 import pytest
@@ -166,6 +167,16 @@ def test_a_torus_is_thinner_than_its_ring():
         shapes.Torus((0.0, 0.5), 0.5)
     with pytest.raises(ValueError, match="ring must not be zero"):
         shapes.Torus((0.0, 0.0), 0.5)
+
+
+def test_an_axis_of_zero_in_a_scene_file():
+    schema = pytest.importorskip("torch_mpm.scene.schema")
+    for name in ("torus", "revolved", "plane"):
+        words = schema.OBSTACLE_WORDS[name].keys
+        given = {key: (0.0, 0.0) if kind.kind in ("point", "vector") else 0.1 for key, kind in words.items()}
+        with pytest.raises(ValueError, match=r"(axis|normal) must not be zero"):
+            shape = schema.OBSTACLE_SHAPES[name]
+            shape.from_words(types.SimpleNamespace(**given | ({"outline": VASE} if name == "revolved" else {})))
 
 
 def test_messages():

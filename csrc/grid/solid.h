@@ -331,8 +331,8 @@ class SolidAt {
       const V first = node_ + nearest.depth * nearest.normal;
       V unused;
       const T start = height_of(k, first, unused);
-      // A node that is equally deep below several faces, one of which may be covered, has a normal between theirs, and
-      // that point is still inside. Samples round such ridges of distances by a quarter of their spacing.
+      // The distance has a ridge where the node is equally deep below several faces. The normal there is between
+      // theirs, and the nearest point is still inside. Samples round a ridge by a quarter of their spacing.
       const T slack = T(0.5) * seam_ + T(0.25) * spacing;
       const bool ridge = start < T(0) - slack && has_others(k, nearest.depth);
       for (int i = 0; i < kLeaning; i++) {

@@ -303,20 +303,21 @@ def obstacles_of(step: Any) -> Sequence[Obstacle]:
     if not isinstance(step, torch.nn.Module):
         return []
     if not isinstance(step, Step):
-        return _obstacles_in(step, {})
+        return _obstacles_in(step, set())
     parts = [part for name, part in step._modules.items() if name != "law" and part is not None]
     if len(parts) == 1 and all([isinstance(b, Obstacle) for b in step.boundaries.entries]):
         return step.boundaries.entries
-    seen: dict[int, Any] = {}
+    seen: set[int] = set()
     return [obstacle for part in parts for obstacle in _obstacles_in(part, seen)]
 
 
-def _obstacles_in(module: Any, seen: dict[int, Any]) -> list[Obstacle]:
-    """Obstacles among a module and those inside it, but for `seen` ones, to which it adds them: as `modules`, which
-    takes longer than the kernels of a small scene."""
+def _obstacles_in(module: Any, seen: set[int]) -> list[Obstacle]:
+    """Obstacles among a module and those inside it. Modules whose ids are in `seen` are skipped, and those found are
+    added. `nn.Module.modules` takes longer than the kernels of a small scene.
+    """
     if id(module) in seen:
         return []
-    seen[id(module)] = module
+    seen.add(id(module))
     found = [module] if isinstance(module, _classes()[1]) else []
     for inner in module._modules.values():
         if inner is not None:

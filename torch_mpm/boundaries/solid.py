@@ -493,8 +493,8 @@ class _Nearest(NamedTuple):
         height, normal: distance of the node [n] [m], and the normal there [n, D].
         first: the nearest point by these [n, D].
         start: distance of that [n] [m]. It is not zero where the distance is inexact or has a ridge.
-        ridge: whether the node may be equally deep below several faces, one of which another obstacle or a wall may
-            cover, bool [n].
+        ridge: whether the node may be equally deep below several faces, bool [n]. Another obstacle or a wall may cover
+            one of them.
         slack: how far its distances are from exact ones at a ridge [m]. Samples round it by a quarter of their spacing.
     """
 
@@ -511,7 +511,7 @@ def _nearest(solid: SolidNodes, k: int, x: Tensor, distance: Tensor) -> _Nearest
     height, normal = obstacle.surface_at(x, solid.scene, solid.time)
     first = x - height[:, None] * normal
     start = obstacle.signed_distance(first, solid.scene, solid.time)
-    slack = 0.5 * solid.seam + (0.25 * obstacle.shape.spacing if isinstance(obstacle.shape, Sampled) else 0)
+    slack = 0.5 * solid.seam + 0.25 * _spacing(obstacle)
     own = torch.full(x.shape[:1], k, device=x.device)
     return _Nearest(height, normal, first, start, (start < -slack) & _has_others(solid, x, distance, own), slack)
 
@@ -602,8 +602,12 @@ def _join(solid: SolidNodes, node: _Nearest, at: Tensor, above: Tensor, toward: 
 
 def _away(solid: SolidNodes, obstacle: Obstacle) -> Tensor:
     """How far around the nearest point of a shape that is known by its distance alone its faces are seen from [m]."""
-    away = 2.5 * solid.seam
-    return away.clamp_min(1.5 * obstacle.shape.spacing) if isinstance(obstacle.shape, Sampled) else away
+    return (2.5 * solid.seam).clamp_min(1.5 * _spacing(obstacle))
+
+
+def _spacing(obstacle: Obstacle) -> float:
+    """Spacing of the samples of a shape [m], by which they round edges; zero of other shapes."""
+    return float(obstacle.shape.spacing) if isinstance(obstacle.shape, Sampled) else 0.0
 
 
 def _surfaces(solid: SolidNodes, obstacle: Obstacle, points: Sequence[Tensor]) -> list[tuple[Tensor, Tensor]]:
@@ -619,9 +623,7 @@ def _are_on_faces(
 ) -> list[Tensor]:
     """Whether the nearest points of the surface to several points [N, D] of each node, by their distance and normal,
     are on faces [N]: a step against the normal of an outer edge is less deep than it is long."""
-    step, shape = solid.seam, obstacle.shape
-    if isinstance(shape, Sampled):  # which rounds edges
-        step = step.clamp_min(shape.spacing)
+    step = solid.seam.clamp_min(_spacing(obstacle))
     below = [at - (above + step)[:, None] * toward for at, (above, toward) in zip(points, seen, strict=True)]
     scene = None if solid.scene is None else solid.scene.repeat(len(points))
     distance = obstacle.signed_distance(torch.cat(below), scene, solid.time)
@@ -755,7 +757,7 @@ class _Best:
         near = torch.stack([_nearness(solid, obstacle) for obstacle in solid.obstacles])
         by_distance = solid.constants([not _has_faces(o) for o in solid.obstacles])
         count = faces.owner.shape[1]
-        if count > 1 and any(isinstance(o.shape, Sampled) for o in solid.obstacles):
+        if count > 1 and any(_spacing(o) > 0 for o in solid.obstacles):
             result = _are_inner(solid, faces, at, step)
         for j in range(count):
             owner = faces.owner[:, j]
@@ -773,8 +775,7 @@ def _are_inner(solid: SolidNodes, faces: _Candidates, at: Tensor, step: Tensor) 
     normal = torch.stack([_height(solid, faces, j, at)[1] for j in range(count)], 1)
     eye = torch.eye(count, dtype=at.dtype, device=at.device).expand(len(at), -1, -1)
     dual = torch.linalg.solve_ex(normal @ normal.mT, eye)[0] @ normal
-    spacings = [o.shape.spacing if isinstance(o.shape, Sampled) else 0.0 for o in solid.obstacles]
-    spacing = solid.constants([float(s) for s in spacings]).to(at.dtype)[faces.owner]
+    spacing = solid.constants([_spacing(o) for o in solid.obstacles]).to(at.dtype)[faces.owner]
     result = torch.ones_like(at[:, 0], dtype=torch.bool)
     for j in range(count):
         point = at + spacing[:, j, None] * (step - 2 * dual[:, j])
@@ -837,10 +838,8 @@ def _solve(solid: SolidNodes, faces: _Candidates, x: Tensor) -> tuple[Tensor, Te
 def _nearness(solid: SolidNodes, obstacle: Obstacle) -> Tensor:
     """How far from the surface of an obstacle a point beside the foot may be [m]. Tangents of edges, as distances alone
     show them, leave the surface; samples round edges."""
-    seam, shape = solid.seam, obstacle.shape
-    if isinstance(shape, Sampled):
-        return seam / 2 + 0.5 * shape.spacing
-    return seam / 2 if _has_faces(obstacle) else seam / 4
+    seam, spacing = solid.seam, _spacing(obstacle)
+    return seam / 2 + 0.5 * spacing if spacing > 0 or _has_faces(obstacle) else seam / 4
 
 
 def _first_of_each(rows: Tensor, keys: Sequence[Tensor]) -> Tensor:

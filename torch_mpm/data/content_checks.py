@@ -6,10 +6,11 @@ import datetime
 from collections.abc import Iterator
 from typing import Any
 
+from ..scene.schema import VECTOR_KEYS
 from .distribution import CHOICE, Words, is_distribution, is_number
 
 LISTS = ("body", "obstacle")
-VECTORS = ("center", "size", "axis", "lower", "upper", "a", "b", "velocity", "normal")
+VECTORS = ("lower", "upper", "velocity", *VECTOR_KEYS)
 """Keys of bodies and obstacles with a number per axis."""
 
 

@@ -32,11 +32,7 @@ from .grid_update import CONTACT_KINDS, CONTACT_NAMES, sum_by_scene_of_blocks, w
 from .obstacle_tables import tables, tables_over
 
 MAX_OBSTACLES = 64  # of one call, csrc/grid/obstacle.h
-KERNEL_SHAPES = {
-    shape.number: shape
-    for shape in vars(shapes).values()
-    if isinstance(shape, type) and issubclass(shape, shapes.Shape) and shape.number is not None
-}
+KERNEL_SHAPES = {shape.number: shape for shape in shapes.SHAPES if shape.number is not None}
 """Shapes of the kernel by their numbers."""
 
 

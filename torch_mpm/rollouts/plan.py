@@ -180,7 +180,11 @@ class RolloutPlan:
         return "\n".join([self.headline(), *others])
 
 
-def check_plan(plan: Any) -> None:
+def check_plan(plan: Any, **others: Any) -> None:
+    """Check the plan of a caller, and that the arguments which it replaces are None."""
+    if any(value is not None for value in others.values()):
+        *first, last = others
+        raise ValueError(f"{', '.join(first)} and {last} must be None with a plan, which has them")
     if not isinstance(plan, RolloutPlan):
         raise TypeError(f"plan must be a RolloutPlan or None, got {shape_of(plan)}")
 

@@ -99,8 +99,7 @@ def rollout(
         check_count("graph", graph, 1)
     steps = Steps(step, n, dt, as_checkpoints(checkpoint), graph, schedule)
     if plan is not None:
-        if checkpoint is not None or graph is not None or schedule is not None:
-            raise ValueError("checkpoint, graph and schedule must be None with a plan, which has them")
+        check_plan(plan, checkpoint=checkpoint, graph=graph, schedule=schedule)
         steps = _as_planned(steps, plan)
     if truncate is None and hook is None and norms is None and prefix == 0 and every == 1 and every is not True:
         check_state(state)
@@ -129,7 +128,6 @@ def _in_parts(steps: Steps, state: State, parts: Parts, plan: RolloutPlan | None
 
 def _as_planned(steps: Steps, plan: RolloutPlan) -> Steps:
     """Steps with the checkpoints, graphs and schedule that a plan was made for."""
-    check_plan(plan)
     graph = plan.steps_per_call if plan.executor == "graph" else None
     schedule = plan.schedule if plan.forced else None
     return steps._replace(checkpoints=plan.checkpoints, graph=graph, schedule=schedule)

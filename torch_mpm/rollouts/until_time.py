@@ -114,9 +114,7 @@ def rollout_to(
     check_count("every", every, 1)
     check_count("most", most, 1)
     if plan is not None:
-        check_plan(plan)
-        if not (checkpoint is None and schedule is None):
-            raise ValueError("checkpoint and schedule must be None with a plan, which has them")
+        check_plan(plan, checkpoint=checkpoint, schedule=schedule)
     options = {"checkpoint": checkpoint, "schedule": schedule} if plan is None else {"plan": plan}
     given = _compensated(step, step.prepare(state), cfl, longest)
     unsorted = plan_call(None, facts_of(Steps(step, 1, 1.0), given)._replace(steps=most)).order > 0

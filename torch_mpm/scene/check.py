@@ -207,7 +207,7 @@ def _dimension_problems(key: str, item: Any, dim: int) -> Iterator[str]:
         yield f"{key}.shape: a {item.shape} needs three dimensions; this scene has two"
         return
     values = vars(item)
-    for name in ("center", "lower", "upper", "a", "b", "size", "normal", "axis", "velocity", "offset"):
+    for name in ("lower", "upper", *schema.VECTOR_KEYS, "velocity", "offset"):
         value = values.get(name)
         if value is not None and len(value) != dim:
             yield f"{key}.{name}: must have {dim} numbers in this {dim}-D scene, got {value}"

@@ -15,7 +15,7 @@ from ..boundaries import Obstacle
 from ..geometry import seed
 from . import schema
 
-PLACES = ("lower", "upper", "center", "a", "b", "offset", "view")
+PLACES = ("lower", "upper", "offset", "view", *schema.POINT_KEYS)
 """Keys of coordinates [m]; `dam` is a single x."""
 
 

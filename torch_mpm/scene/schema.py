@@ -419,14 +419,15 @@ def _obstacle(shape: type[Shape], words: SceneWords) -> type[Obstacle]:
     return create_model(f"{shape.name.capitalize()}Obstacle", __base__=Obstacle, __doc__=words.summary, **fields)
 
 
-OBSTACLE_SHAPES: dict[str, type[Shape]] = {
-    shape.name: shape
-    for shape in vars(shapes).values()
-    if isinstance(shape, type) and issubclass(shape, Shape) and shape.words is not None
-}
+OBSTACLE_SHAPES = {shape.name: shape for shape in shapes.SHAPES if shape.words is not None}
 """Shapes of obstacles by their names; they include every new class in torch_mpm.shapes with words."""
 
 OBSTACLE_WORDS = {name: shape.words for name, shape in OBSTACLE_SHAPES.items() if shape.words is not None}
+_KEYS = [item for words in OBSTACLE_WORDS.values() for item in words.keys.items()]
+POINT_KEYS = tuple(dict.fromkeys(name for name, key in _KEYS if key.kind == "point"))
+"""Keys of shapes of obstacles with coordinates [m]."""
+VECTOR_KEYS = tuple(dict.fromkeys(name for name, key in _KEYS if key.kind in ("point", "vector")))
+"""Keys of shapes of obstacles with a number per axis."""
 
 AnyObstacle: Any = Annotated[
     functools.reduce(operator.or_, [_obstacle(OBSTACLE_SHAPES[name], words) for name, words in OBSTACLE_WORDS.items()]),

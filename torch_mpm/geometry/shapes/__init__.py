@@ -23,8 +23,12 @@ from .revolved import Cylinder, Revolved
 from .simple import Box, Capsule, Plane, Sphere
 from .torus import Torus
 
+SHAPES = tuple(shape for shape in vars().values() if isinstance(shape, type) and issubclass(shape, Shape))
+"""All shapes."""
+
 __all__ = [
     "SDF",
+    "SHAPES",
     "Box",
     "Capsule",
     "Cylinder",

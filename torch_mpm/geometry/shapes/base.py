@@ -158,6 +158,12 @@ def one_face(height: Tensor, normal: Tensor, flat: bool) -> Faces:
     return Faces(height[:, None], normal[:, None], torch.zeros_like(height)[:, None], flat)
 
 
+def split_along(x: Tensor, axis: Tensor) -> tuple[Tensor, Tensor]:
+    """Positions along a unit vector [D] or [N, D], [N, 1], and the rest of x [N, D]."""
+    along = (x * axis).sum(1, keepdim=True)
+    return along, x - along * axis
+
+
 def ball_volume(dim: int, radius: float) -> float:
     """Volume of a ball in 3-D, area of a disc in 2-D, length in 1-D; infinite where a power would raise."""
     return {1: 2.0, 2: math.pi, 3: 4 / 3 * math.pi}[dim] * math.prod([radius] * dim)

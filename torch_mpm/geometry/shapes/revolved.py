@@ -15,7 +15,7 @@ from .. import surface_mesh
 from ..per_scene import Value, direction, extent, floats
 from ..surface_mesh import Array, SurfaceMesh
 from ..vectors import norm, unit
-from .base import Faces, SceneKey, SceneWords, Shape, numbers_of
+from .base import Faces, SceneKey, SceneWords, Shape, numbers_of, split_along
 
 
 class Revolved(Shape):
@@ -68,8 +68,7 @@ class Revolved(Shape):
     def _split(self, x: Tensor, scene: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
         """The axis [D] or [N, D], positions along it [N, 1], and the rest of x [N, D]."""
         axis = unit(self.at_nodes("axis", x, x.shape[1:], scene))
-        along = (x * axis).sum(1, keepdim=True)
-        return axis, along, x - along * axis
+        return axis, *split_along(x, axis)
 
     def _polygon(self, p: Tensor) -> tuple[Tensor, Tensor]:
         """Signed distance [N] of points [N, 2] from the polygon, and outward normal [N, 2] of the nearest edge."""

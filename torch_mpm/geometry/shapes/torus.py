@@ -13,7 +13,7 @@ from .. import surface_mesh
 from ..per_scene import Value, direction, extent
 from ..surface_mesh import Array, SurfaceMesh
 from ..vectors import norm, unit
-from .base import Faces, SceneKey, SceneWords, Shape, around_origin, ball_volume, one_face
+from .base import Faces, SceneKey, SceneWords, Shape, around_origin, ball_volume, one_face, split_along
 
 
 class Torus(Shape):
@@ -41,15 +41,15 @@ class Torus(Shape):
 
     def __init__(self, ring: Value, radius: float | Tensor) -> None:
         self.ring, self.radius = direction("ring", ring), extent("radius", radius)
-        if not (isinstance(self.ring, Tensor) or isinstance(self.radius, Tensor)):
-            if not self.radius < math.hypot(*self.ring):
-                raise ValueError(f"radius must be below that of the circle, {math.hypot(*self.ring):g} m, got {radius}")
+        if isinstance(self.ring, Tensor) or isinstance(self.radius, Tensor):
+            return
+        if not self.radius < math.hypot(*self.ring):
+            raise ValueError(f"radius must be below that of the circle, {math.hypot(*self.ring):g} m, got {radius}")
 
     def surface(self, x: Tensor, scene: Tensor | None = None) -> tuple[Tensor, Tensor]:
         ring = self.at_nodes("ring", x, x.shape[1:], scene)
         axis = unit(ring)
-        along = (x * axis).sum(1, keepdim=True)
-        across = x - along * axis
+        along, across = split_along(x, axis)
         offset = torch.cat([norm(across)[:, None] - norm(ring).unsqueeze(-1), along], 1)
         normal = unit(offset)
         distance = norm(offset) - self.at_nodes("radius", x, (), scene)
@@ -75,5 +75,5 @@ class Torus(Shape):
 
     @classmethod
     def from_words(cls, words: Any) -> tuple[Shape, Any]:
-        size = words.ring_radius / math.hypot(*words.axis)
+        size = words.ring_radius / math.hypot(*direction("axis", words.axis))
         return cls([size * a for a in words.axis], words.radius), words.center
