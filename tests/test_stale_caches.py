@@ -289,6 +289,18 @@ def test_assigned_kinds_of_walls(device):
         assert not torch.allclose(a, b)
 
 
+def test_gravity_on_another_grid(device):
+    """Numbers serve a grid with another number of scenes."""
+    step = mpm.Step(GRID, ELASTIC, (0.0, -9.8))
+    ends(step, start(device))
+    step.grid = mpm.Grid(0.1, (0.0, 0.0), (1.0, 1.0), scenes=2)
+    step.reset()
+    state = start(device)
+    state = state.replace(scene=torch.arange(len(state), device=device, dtype=torch.int32) % 2)
+    for a, b in zip(ends(step, state), ends(mpm.Step(step.grid, ELASTIC, (0.0, -9.8)), state), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-12)
+
+
 def test_whole_numbers_of_a_law():
     """Integers and float32 numbers are accepted like floats."""
     law = mpm.NeoHookean(E=1e5, nu=0.3)

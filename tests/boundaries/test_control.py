@@ -498,6 +498,57 @@ def test_a_call_depends_on_its_arguments_alone(device):
         torch.testing.assert_close(mpm.rollout(step, state, N, DT).v, ends[0].v, rtol=1e-9, atol=1e-9)
 
 
+POSITION = [0.36, 0.25]
+CHANGES = {
+    "number of a list": lambda paddle: paddle.position.__setitem__(0, 0.3),
+    "another list": lambda paddle: setattr(paddle, "position", [0.3, 0.25]),
+    "a tensor": lambda paddle: setattr(paddle, "position", torch.tensor([0.3, 0.25], dtype=F64)),
+    "velocity": lambda paddle: setattr(paddle, "velocity", (0.5, 0.0)),
+    "start of the velocity": lambda paddle: (setattr(paddle, "velocity", (0.5, 0.0)), setattr(paddle, "start", -0.1)),
+    "end": lambda paddle: setattr(paddle, "end", N * DT / 2),
+    "place": lambda paddle: paddle.place((0.3, 0.25), 0.1),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
+def test_a_state_made_anew_finds_obstacles_at_their_latest_attributes(change):
+    """The second rollout from the same state begins at the attributes of now, as that of a new obstacle does."""
+
+    def ends(before: Callable[[mpm.Step], Any]) -> tuple[mpm.State, mpm.State]:
+        paddle = box((0.4, 0.25))
+        paddle.position = list(POSITION)
+        step, state = step_with(paddle), block()
+        before(step)
+        change(paddle)
+        end = mpm.rollout(step, state, N, DT)
+        paddle.velocity, paddle.position = None, (0.38, 0.25)  # From where the state has left it.
+        return end, mpm.rollout(step, end, N, DT)
+
+    again, fresh = ends(lambda step: mpm.rollout(step, block(), N, DT)), ends(lambda step: None)
+    for a, b in zip(again, fresh, strict=True):
+        for name in ("x", "v", "F"):
+            torch.testing.assert_close(getattr(a, name), getattr(b, name), rtol=1e-12, atol=1e-12)
+
+
+def test_poses_are_differentiable_after_a_call_in_inference_mode():
+    """The first pose of a paddle, from which it moves to an assigned one, has its gradient."""
+
+    def gradient(before: bool) -> Tensor:
+        first = start().requires_grad_()
+        paddle = box(first)
+        step = step_with(paddle)
+        if before:
+            with torch.inference_mode():
+                mpm.rollout(step, block(), N, DT)
+        state = mpm.rollout(step, block(), N, DT)
+        paddle.position = at(1)
+        mpm.rollout(step, state, N, DT).v.sum().backward()
+        assert first.grad is not None
+        return first.grad
+
+    torch.testing.assert_close(gradient(True), gradient(False), rtol=1e-12, atol=1e-12)
+
+
 def test_an_obstacle_is_placed_without_a_push(device):
     paddle = box(start(device=device), rotation=0.1)
     step = step_with(paddle)

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from ..grid.grid import Blocks, Grid
-from ..ops import contact, contact_impulses, fusible
-from ..ops.contact import MAX_OBSTACLES, is_solid
+from ..ops import contact, contact_impulses
+from ..ops.contact import MAX_OBSTACLES, is_of_kernel, is_solid
 from ..ops.impulses import impulse_of_nodes
 from ..precision import from_half, full_precision
 from ..state.state import State
@@ -115,6 +115,6 @@ def _neighbours(boundaries: Sequence[Any], time: float | Tensor) -> list[tuple[s
             runs.append((kind, []))
         runs[-1][1].append(boundary)
     return [
-        (FUSED if kind == SOLID and all(fusible(boundary, time) for boundary in run) else kind, run)
+        (FUSED if kind == SOLID and all([is_of_kernel(boundary, time) for boundary in run]) else kind, run)
         for kind, run in runs
     ]

@@ -153,10 +153,10 @@ def control_step(
     """
     obstacles = [] if n == 0 or torch.compiler.is_compiling() or _THREAD.steady else obstacles_of(step)
     if not obstacles or is_traced(state.x) or is_captured(state.x):
-        return contextlib.nullcontext(_unchanged)
+        return _NO_CONTROL
     _tell_apart(obstacles)
     if _nothing_new(obstacles, state.poses):
-        return contextlib.nullcontext(_unchanged)
+        return _NO_CONTROL
     if any(o.course is not None for o in obstacles):
         return _inside(step, obstacles, state, dt)
     return _control_step(step, obstacles, state, Span(state.time, n * dt if seconds is None else seconds, dt))
@@ -234,8 +234,10 @@ def motions_now(step: Any, state: State) -> Callable[[], contextlib.AbstractCont
 
 @contextlib.contextmanager
 def _control_step(step: Any, obstacles: Sequence[Obstacle], state: State, span: Span) -> Iterator[Leave]:
-    courses = [course_of(o, state.poses.get(o.key), span, state.x.device) for o in obstacles]
-    _report(step, obstacles, dict(enumerate(courses)))
+    poses, device = state.poses, state.x.device
+    courses = [course_of(o, poses.get(o.key), span, device) for o in obstacles]
+    if any([course.contradicts is not None for course in courses]):
+        _report(step, obstacles, dict(enumerate(courses)))
     try:
         for obstacle, course in zip(obstacles, courses, strict=True):
             obstacle.follow(course, span.pace)
@@ -304,9 +306,10 @@ def obstacles_of(step: Any) -> Sequence[Obstacle]:
         return []
     if not isinstance(step, Step):
         return _obstacles_in(step, set())
+    entries = step.boundaries.entries
+    if len(step._modules) == 2 and all([isinstance(b, Obstacle) for b in entries]):  # the law and the boundaries
+        return entries
     parts = [part for name, part in step._modules.items() if name != "law" and part is not None]
-    if len(parts) == 1 and all([isinstance(b, Obstacle) for b in step.boundaries.entries]):
-        return step.boundaries.entries
     seen: set[int] = set()
     return [obstacle for part in parts for obstacle in _obstacles_in(part, seen)]
 
@@ -338,6 +341,9 @@ def _unchanged(state: State) -> State:
     return state
 
 
+_NO_CONTROL = contextlib.nullcontext(_unchanged)
+
+
 def _underway(course: Course) -> Left:
     """Pose of an obstacle to store in the middle of a control step."""
     if course.during is None:
@@ -347,11 +353,12 @@ def _underway(course: Course) -> Left:
 
 def _leave(state: State, obstacles: Sequence[Obstacle]) -> State:
     """A state with the poses of its obstacles."""
-    poses = {key: left for key, left in state.poses.items() if key() is not None}
+    before = state.poses
+    poses = {key: left for key, left in before.items() if key() is not None}
     for obstacle in obstacles:
         assert obstacle.course is not None
         poses[obstacle.key] = obstacle.course.after
-    same = len(poses) == len(state.poses) and all(state.poses.get(key) is left for key, left in poses.items())
+    same = len(poses) == len(before) and all([before.get(key) is left for key, left in poses.items()])
     return state if same else state.with_poses(poses)
 
 
@@ -387,7 +394,7 @@ def _count(step: Any, wrong: Tensor) -> None:
 def course_of(obstacle: Obstacle, left: Left | None, span: Span, device: torch.device) -> Course:
     """Course of an obstacle in a control step, from its stored pose; None without one."""
     if left is None or left.placements != obstacle.placements:
-        return Course(None, _left_at(obstacle))
+        return _placed(obstacle)
     same = _sameness(obstacle, left)
     if all(same) and not left.arrives and (left.moves is None or left.known is None):
         return Course(left.moves, left if left.known is None else left._replace(known=None))
@@ -403,6 +410,18 @@ def course_of(obstacle: Obstacle, left: Left | None, span: Span, device: torch.d
     wrong = [part.contradicts for part in (centre, rotation) if part.contradicts is not None]
     contradicts = None if not wrong else wrong[0] if len(wrong) == 1 else wrong[0] | wrong[1]
     return Course(during, later._replace(moves=after, arrives=arrives), contradicts)
+
+
+def _placed(obstacle: Obstacle) -> Course:
+    """Course of an obstacle that begins at its attributes; the same object while these are the same numbers."""
+    latest = obstacle.placed
+    if latest is not None and _is_as_left(obstacle, latest.after):
+        if latest.after.values[len(ASSIGNED) :] == (obstacle.start, obstacle.end):
+            return latest
+    course = Course(None, _left_at(obstacle))
+    of_tensors = any([isinstance(value, Tensor) for value in course.after.values])
+    vars(obstacle)["placed"] = None if of_tensors else course  # Copies of tensors belong to a graph or to inference.
+    return course
 
 
 def _left_at(obstacle: Obstacle) -> Left:
@@ -433,7 +452,7 @@ def _motion(values: Sequence[Any]) -> RigidMotion:
 def _assigned(motion: RigidMotion) -> tuple[Any, ...]:
     """Attributes that define the motion. Read from dictionaries: `getattr` of a buffer takes a microsecond."""
     plain, buffers, parameters = vars(motion), motion._buffers, motion._parameters
-    return tuple(
+    values = [
         plain[name]
         if name in plain
         else buffers[name]
@@ -442,7 +461,8 @@ def _assigned(motion: RigidMotion) -> tuple[Any, ...]:
         if name in parameters
         else motion._modules[name]
         for name in ASSIGNED
-    )
+    ]
+    return tuple(values)
 
 
 def _sameness(obstacle: Obstacle, left: Left) -> list[bool]:
@@ -451,7 +471,7 @@ def _sameness(obstacle: Obstacle, left: Left) -> list[bool]:
 
 
 def _is_as_left(obstacle: Obstacle, left: Left) -> bool:
-    return left.placements == obstacle.placements and all(_sameness(obstacle, left))
+    return left.placements == obstacle.placements and is_same(left.given, _assigned(obstacle))
 
 
 def _copy(name: str, value: Any) -> Any:

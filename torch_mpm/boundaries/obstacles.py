@@ -17,6 +17,7 @@ from ..geometry import shapes
 from ..geometry.per_scene import Value, finite, per_node
 from ..geometry.shapes import Shape
 from ..geometry.vectors import transform
+from ..laws.parameters import tensors_in
 from .motion import Path, Pose, RigidMotion, to_body
 from .solid import SolidNodes, after_contact
 from .walls import CONTACTS
@@ -99,6 +100,8 @@ class Obstacle(RigidMotion):
     """
 
     RANKS: ClassVar = {**RigidMotion.RANKS, "friction": 0}
+    placed: Course | None = None
+    """Course of the latest control step that began at the attributes, if these were numbers."""
 
     def __init__(
         self,
@@ -354,7 +357,7 @@ class Obstacle(RigidMotion):
 def motion_tensors(obstacle: Obstacle) -> list[Tensor]:
     """The tensors of an obstacle: of its shape, where it is and how it moves."""
     values = (*vars(obstacle).values(), *vars(obstacle.shape).values())
-    return [v for v in values if isinstance(v, Tensor)] + [*obstacle.parameters(), *obstacle.buffers()]
+    return [v for v in values if isinstance(v, Tensor)] + tensors_in(obstacle)
 
 
 # ---- obstacles of one shape each

@@ -166,15 +166,18 @@ def is_same(known: Any, value: Any) -> bool:
         return True
     if isinstance(known, Remembered):
         return known.is_now(value)
+    if isinstance(value, (tuple, list)):
+        if not isinstance(known, tuple) or len(known) != len(value):
+            return False
+        for a, b in zip(known, value, strict=True):  # A generator takes longer than most comparisons.
+            if a is not b and not is_same(a, b):
+                return False
+        return True
     if isinstance(value, Tensor):
         return False
     if isinstance(value, np.ndarray):
-        value = value.tolist()
-    if not isinstance(value, (list, tuple)):
-        return bool(known == value)
-    if not isinstance(known, tuple) or len(known) != len(value):
-        return False
-    return all(a is b or is_same(a, b) for a, b in zip(known, value, strict=True))
+        return is_same(known, value.tolist())
+    return bool(known == value)
 
 
 class DeviceConstantCache:

@@ -249,8 +249,10 @@ class Grid(Lattice):
 
     def watch(self, status: Tensor) -> None:
         """Adapt `max_blocks` to the `status` of an activation, without waiting for the device."""
+        if not status.is_cuda:
+            return
         # As in `_grow`, a compiled step must not access the event.
-        if is_traced(status) or not self._grows or self._pending is not None or status.device.type != "cuda":
+        if is_traced(status) or not self._grows or self._pending is not None:
             return
         if is_captured(status):
             return
@@ -350,4 +352,5 @@ class Blocks(Topology):
     @property
     def wanted(self) -> int:
         """Number of active blocks that this activation needed, which may exceed the pool; synchronises."""
-        return int(self.status[0, Status.BLOCKS_NOW])
+        now: int = self.status[0].tolist()[Status.BLOCKS_NOW]
+        return now

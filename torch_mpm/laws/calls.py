@@ -10,6 +10,7 @@ from .active import FIBRE, Active
 from .compiled import CompiledLaw
 from .material import Material
 from .mixture import Mixture
+from .parameters import Overlay
 
 
 class LawCalls(NamedTuple):
@@ -41,8 +42,10 @@ def passive(law: Material) -> Material:
     return law.law if type(law) is Active else law
 
 
-def law_calls(law: Material, state: Any) -> LawCalls:
-    """Calls of compiled laws for a state, which may have a time step `dt`; some may be `Active`.
+def law_calls(law: Material, state: Any, dt: float | Tensor | None = None) -> LawCalls:
+    """Calls of compiled laws for a state and a time step [s]; some may be `Active`.
+
+    Without `dt` rate-dependent laws use that of the state.
 
     Raises:
         ValueError: where the state has no material, or one that the mixture does not have, as `Mixture.check_material`.
@@ -54,8 +57,9 @@ def law_calls(law: Material, state: Any) -> LawCalls:
     history_names: list[list[str]] = []
     for part in laws:
         own: CompiledLaw = passive(part)  # type: ignore[assignment]
+        with_dt: Any = state if dt is None or not own.rate_dependent else Overlay(state, dt=dt)
         names.append(own._name(state))
-        each.append((own.option_bits(), own._arguments(state)[1], own._history(state)))
+        each.append((own.option_bits(), own._arguments(with_dt)[1], own._history(state)))
         history_names.append(own.history_names())
         if isinstance(part, Active):
             names[-1] += f"+{FIBRE}"

@@ -216,7 +216,7 @@ class CompiledLaw(Material):
     def _scenes(self, state: State, parameters: Sequence[Tensor]) -> int | None:
         """Number of scenes, where a parameter is given per scene."""
         P = state.x.shape[0]
-        return None if all(needs_no_scenes(p, P) for p in parameters) else state.scenes
+        return None if all([needs_no_scenes(p, P) for p in parameters]) else state.scenes
 
     def wave_modulus(self, state: State) -> Tensor:
         """Upper bound of rest density times squared wave speed after the return map [P] [Pa]; exact at rest."""

@@ -225,6 +225,22 @@ def has_hooks(module: nn.Module) -> bool:
     )
 
 
+def modules_in(module: nn.Module) -> list[nn.Module]:
+    """A module and those inside it, shared ones more than once: `modules` takes longer than the kernels of a small
+    scene."""
+    found = [module]
+    for inner in module._modules.values():
+        if inner is not None:
+            found += modules_in(inner)
+    return found
+
+
+def tensors_in(module: nn.Module) -> list[Tensor]:
+    """Parameters and buffers of a module and those inside it."""
+    parts = modules_in(module)
+    return [t for m in parts for t in (*m._parameters.values(), *m._buffers.values()) if t is not None]
+
+
 class TensorModule(nn.Module):
     """Module with tensors as buffers, so that `.to` moves them and a `state_dict` contains them.
 

@@ -51,7 +51,12 @@ def fusible(obstacle: Any, time: float | Tensor, paths: bool = False) -> bool:
     A position as a function of time, and a time that requires grad, need `Obstacle.apply`; so does any subclass with a
     `forward` or an `apply` of its own. With `paths`, whether `substeps` does, where such a position may be, too.
     """
-    if not is_solid(obstacle) or obstacle.shape.number is None or (obstacle.follows_path and not paths):
+    return is_solid(obstacle) and is_of_kernel(obstacle, time, paths)
+
+
+def is_of_kernel(obstacle: Obstacle, time: float | Tensor, paths: bool = False) -> bool:
+    """`fusible` for an obstacle for which `is_solid` holds."""
+    if obstacle.shape.number is None or (not paths and obstacle.follows_path):
         return False
     return not (isinstance(time, Tensor) and time.requires_grad)
 

@@ -11,7 +11,6 @@ from torch import Tensor
 from ..errors import check_count, check_flag, shape_of
 from ..grid.topology import Status
 from ..laws.calls import law_calls
-from ..laws.parameters import Overlay
 from ..ops.autograd import dispatch
 from ..ops.contact import obstacle_arguments
 from ..ops.grid_update import per_scene, wall_arguments
@@ -137,8 +136,7 @@ def _arguments(
     times = StepTimes.of(state, n, dt, grid.scenes) if boundaries and follows_paths(step) else None
     pool = grid.pool(state.x, state.scene)
     law.check_parameters(len(state), grid.scenes)
-    given: Any = Overlay(state, dt=dt)
-    calls = law_calls(law, given)
+    calls = law_calls(law, state, dt)
     apic = step.transfer == "apic"
     table, *others = obstacle_arguments(boundaries, state.x, grid.scenes, times)
     of_table = table is not None and table.requires_grad
@@ -191,6 +189,8 @@ def _in_shape(times: Tensor, time: float | Tensor, dt: float | Tensor) -> Tensor
 
 def _gravity(step: Step, x: Tensor) -> Tensor | None:
     gravity = step.gravity_like(x)
+    if not isinstance(step.gravity, Tensor):
+        return gravity  # [B, D] of numbers
     return None if gravity is None else per_scene(gravity, x, step.grid.scenes, step.grid.dim)
 
 

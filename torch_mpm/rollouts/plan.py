@@ -29,7 +29,7 @@ from ..laws import CompiledLaw
 from ..laws.active import Active
 from ..laws.calls import laws_of, passive
 from ..laws.custom import CustomLaw
-from ..laws.parameters import has_hooks
+from ..laws.parameters import has_hooks, modules_in, tensors_in
 from ..ops.arguments import check_choice, split_dt
 from ..ops.contact import MAX_OBSTACLES, fusible
 from ..ops.obstacle_tables import numbers_of_a_step, path_requires_grad
@@ -292,9 +292,9 @@ def why_not_fused(step: Any, state: State, dt: float | Tensor) -> str | None:
     """Reason why the fused op does not support the steps; None if it does."""
     if type(step) is not Step:
         return f"{type(step).__name__} may do more than a Step" if isinstance(step, Step) else "it is no Step"
-    x, law = state.x, step.law
-    for name, value in (("dt", dt), ("the time of the state", state.time)):
-        if requires_grad(value) and (step._flip_share or step.boundaries.reads_time):
+    x, law, boundaries = state.x, step.law, step.boundaries
+    for name, value in (("dt", dt), ("the time of the state", state.scene_time)):
+        if requires_grad(value) and (step._flip_share or boundaries.reads_time):
             return f"{name} requires a gradient, with FLIP or boundaries that may read the time"
     if isinstance(dt, Tensor) and dt.dtype != x.dtype:
         return f"dt is a tensor, but not in {str(x.dtype).removeprefix('torch.')}"
@@ -314,12 +314,11 @@ def why_not_fused(step: Any, state: State, dt: float | Tensor) -> str | None:
     for part in laws:
         if not isinstance(part, CompiledLaw) or not part.is_all_of_its_update() or type(part).forward is not _FORWARD:
             return f"{type(part).__name__} is more than a compiled law"
-    if any(has_hooks(module) for module in (step, *law.modules())):
+    if any([has_hooks(module) for module in (step, *modules_in(law))]):
         return "there are hooks"
-    boundaries = step.boundaries.entries
-    if not all(isinstance(b, Obstacle) and fusible(b, 0.0, paths=True) for b in boundaries):
+    if not all([isinstance(b, Obstacle) and fusible(b, 0.0, paths=True) for b in boundaries.entries]):
         return "a boundary acts by torch operations"
-    if len(boundaries) > MAX_OBSTACLES:
+    if len(boundaries.entries) > MAX_OBSTACLES:
         return f"there are more than {MAX_OBSTACLES} obstacles"
     if torch.is_grad_enabled() and any(part.has_functions for part in laws):
         return "a parameter is a function, which may have a gradient"
@@ -331,7 +330,7 @@ _FORWARD = CompiledLaw.forward
 
 def _why_not_eager(x: Tensor) -> str | None:
     """Reason why steps must be launched from Python one by one, where other code observes them."""
-    if torch.compiler.is_compiling() or is_traced(x) or is_captured(x) or is_transformed():
+    if is_traced(x) or is_captured(x) or is_transformed():
         return "it is compiled, captured or transformed"
     return "anomaly detection inspects every step" if detecting() else None
 
@@ -445,10 +444,10 @@ def facts_of(steps: Steps, state: State, stores_all: bool = False) -> Facts:
         step.stress_form == "mls",
         has_mirrors(step),
         state.impulse is not None,
-        isinstance(dt, Tensor) or isinstance(state.time, Tensor),
+        isinstance(dt, Tensor) or state.scene_time is not None,
         state.scene is not None,
         state.ids is not None,
-        sum(2 if isinstance(part, Active) else 1 for part in laws),
+        sum([2 if isinstance(part, Active) else 1 for part in laws]),
         len(laws) > 1,
         False,
         not x.is_cuda or _is_uniform(laws[0]),
@@ -500,12 +499,12 @@ def wants_gradient(steps: Steps, state: State) -> bool:
 
 def differentiates(step: Step, state: State, dt: float | Tensor) -> bool:
     """The same, without the results of functions of time."""
-    return requires_grad(dt) or any(t.requires_grad for t in _differentiable(step, state))
+    return requires_grad(dt) or any([t.requires_grad for t in _differentiable(step, state)])
 
 
 def follows_paths(step: Step) -> bool:
     """Whether the position of an obstacle is a function of time."""
-    return any(b.follows_path for b in _obstacles(step))
+    return any([b.follows_path for b in step.boundaries.entries if isinstance(b, Obstacle)])
 
 
 def _obstacles(step: Step) -> list[Obstacle]:
@@ -527,4 +526,4 @@ def _differentiable(step: Step, state: State) -> list[Tensor]:
     )
     gravity = [step.gravity] if isinstance(step.gravity, Tensor) else []
     obstacles = [t for b in _obstacles(step) for t in motion_tensors(b)]
-    return [*(t for t in fields if t is not None), *gravity, *step.law.parameters(), *step.law.buffers(), *obstacles]
+    return [*(t for t in fields if t is not None), *gravity, *tensors_in(step.law), *obstacles]

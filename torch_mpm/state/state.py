@@ -59,7 +59,9 @@ class Time:
             number = torch.compiler.is_compiling() and time.dim() == 0 and time.dtype == torch.float64
             kept = (time,) if number and time.device.type == "cpu" and not time.requires_grad else time
         else:
-            seconds = float(check_number("time", time, kinds="a number or a tensor [B]"))
+            seconds = time
+            if not (isinstance(time, float) and math.isfinite(time)):
+                seconds = float(check_number("time", time, kinds="a number or a tensor [B]"))
             kept = (torch.scalar_tensor(seconds, dtype=torch.float64, device="cpu"),)
         state.__dict__["_time"] = kept
 
@@ -134,19 +136,18 @@ class State:
         P, D = x.shape
         shapes = {"[P]": (P,), "[P, D]": (P, D), "[P, D, D]": (P, D, D)}
         for name in names:
+            value = self.__dict__.get(name)
+            if value is None and name not in _NEEDED:
+                continue
             if name in _SYMBOLS:
                 symbols = _SYMBOLS[name]
-                check_like(name, self.__dict__[name], x, shapes[symbols], symbols, name in _NEEDED)
+                check_like(name, value, x, shapes[symbols], symbols, name in _NEEDED)
             elif name in _INDICES:
-                check_index(name, self.__dict__[name], x, _INDICES[name])
-        if "impulse" in names and self.impulse is not None:
-            _check_impulse(self.impulse, x)
-        if "extra" in names:
-            if not isinstance(self.extra, dict):
-                raise TypeError(f"extra must be a dict of tensors [P, ...], got {shape_of(self.extra)}")
-            for name, value in self.extra.items():
-                if not isinstance(value, Tensor) or value.shape[:1] != (P,):
-                    raise ValueError(f"extra[{name!r}] must have {P} rows, got {shape_of(value)}")
+                check_index(name, value, x, _INDICES[name])
+            elif name == "impulse":
+                _check_impulse(value, x)
+            elif name == "extra":
+                _check_extra(value, P)
 
     def check_assigned(self) -> None:
         """Check fields that may have been assigned since, and that ops of transfers do not check.
@@ -204,6 +205,12 @@ class State:
         time = state.pop("_time")
         self.__dict__.update({"x_residual": None} | state)  # Fields that earlier versions lack.
         self.time = time if isinstance(time, Tensor) else time[0].item()
+
+    @property
+    def scene_time(self) -> Tensor | None:
+        """The time where it is a tensor [B]; None where it is a number, which is not read."""
+        time = self.__dict__["_time"]
+        return time if isinstance(time, Tensor) else None
 
     @property
     def scenes(self) -> int | None:
@@ -462,7 +469,7 @@ _SYMBOLS = {
     **dict.fromkeys(("C", "F"), "[P, D, D]"),
 }
 """Shapes of floating fields."""
-_NEEDED = ("v", "mass", "volume")
+_NEEDED = ("v", "mass", "volume", "extra")
 _INDICES = {"scene": torch.int32, "material": torch.int32, "ids": torch.int64}
 
 
@@ -500,6 +507,14 @@ def _count_scenes(state: State) -> int | None:
     if is_traced(state.scene) or is_captured(state.scene):
         return None
     return scenes_up_to(state.scene)
+
+
+def _check_extra(extra: Any, particles: int) -> None:
+    if not isinstance(extra, dict):
+        raise TypeError(f"extra must be a dict of tensors [P, ...], got {shape_of(extra)}")
+    for name, value in extra.items():
+        if not isinstance(value, Tensor) or value.shape[:1] != (particles,):
+            raise ValueError(f"extra[{name!r}] must have {particles} rows, got {shape_of(value)}")
 
 
 def _check_impulse(impulse: Any, x: Tensor) -> None:

@@ -18,12 +18,12 @@ if TYPE_CHECKING:
 def clocks(state: State, dt: float | Tensor, scenes: int) -> tuple[float, Tensor | None, Tensor | None]:
     """Time step [s] as a number, or time steps and times in float64 for each scene [B]."""
     number, scene_dt = split_dt(dt, scenes, state.x)
-    if scene_dt is None and not isinstance(state.time, Tensor):
+    time = state.scene_time
+    if scene_dt is None and time is None:
         return number, None, None
     each_dt = state.x.new_ones(scenes) if scene_dt is None else scene_dt.contiguous()
-    time = state.time
-    if not isinstance(time, Tensor):
-        time = state.x.new_full((1,), time, dtype=torch.float64)
+    if time is None:
+        time = state.x.new_full((1,), float(state.time), dtype=torch.float64)
     return number, each_dt, time.detach().reshape(-1).expand(scenes).contiguous()
 
 
@@ -40,7 +40,7 @@ def time_like(time: float | Tensor, like: Tensor) -> float | Tensor:
     return time.to(like.dtype) if isinstance(time, Tensor) else time
 
 
-def requires_grad(value: float | Tensor) -> bool:
+def requires_grad(value: float | Tensor | None) -> bool:
     """Whether a time or time step has a gradient at present."""
     return isinstance(value, Tensor) and value.requires_grad and torch.is_grad_enabled()
 

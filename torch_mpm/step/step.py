@@ -386,7 +386,7 @@ class Step(TensorModule):
         def make() -> Tensor:
             return torch.tensor(gravity, dtype=x.dtype, device=x.device).expand(self.grid.scenes, -1).contiguous()
 
-        return self._kept_gravity.get((gravity, x.dtype, x.device), make, x)
+        return self._kept_gravity.get((gravity, self.grid.scenes, x.dtype, x.device), make, x)
 
     def project(self, state: State) -> tuple[State, Tensor]:
         """A state whose particles inside obstacles are moved to the nearest point of free space, and how many of each
