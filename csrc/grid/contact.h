@@ -279,43 +279,22 @@ MPM_HD Vector<T, D> after_contact(const SlotPoses<T, D>& poses, const NodeTouch<
   return touch.obstacle >= 0 ? touch.after(v) : v;
 }
 
-// A node whose thread looks at it alone: the slot and its touch are found in one loop over the obstacles.
+// Of a node whose thread looks at it alone: the slot and its touch are found in one loop over the obstacles.
 template <class T, int D>
-struct LoneNode {
-  ContactSlot<T, D> slot;
-  NodeTouch<T, D> touch;
+MPM_HD NodeTouch<T, D> lone_touch(const ContactArguments<T, D>& a, int scene, const int (&corner)[D], int local) {
+  NearestSurface<T, D> nearest(a, node_position(a, corner, local));
+  const ContactSlot<T, D> slot = contact_slot(a, scene, corner, nearest);
+  if (!slot.near) return {};
+  return nearest.found(slot.walled);
+}
 
-  MPM_HD void find(const ContactArguments<T, D>& a, int scene, const int (&corner)[D], int local) {
-    NearestSurface<T, D> nearest(a, node_position(a, corner, local));
-    slot = contact_slot(a, scene, corner, nearest);
-    touch = slot.near ? nearest.found(slot.walled) : NodeTouch<T, D>();
-  }
-
-  // Replaces the velocity of the node by that after contact. By all threads of a warp, as `any_of_warp`.
-  MPM_HD void apply(bool wanted, const ContactArguments<T, D>& a, int local, Vector<T, D>& v) const {
-    const bool several = wanted && touch.obstacle == NodeTouch<T, D>::several;
-    if (any_of_warp(several)) {
-      apply_several(several, a, *this, local, v);
-      join_warp();
-    }
-    if (wanted && touch.obstacle >= 0) v = touch.after(v);
-  }
-
- private:
-  MPM_HD_CALL static void apply_several(bool wanted, const ContactArguments<T, D>& a, const LoneNode& node, int local,
-                                        Vector<T, D>& v) {
-    if (!wanted) return;
-    apply_surfaces(true, SlotPoses<T, D>(a, node.slot), node_position(a, node.slot.corner, local), v);
-  }
-};
-
-// Replaces the velocity of a node by that after contact. By all threads of a warp, as `any_of_warp`.
+// Replaces the velocity of a node by that after contact with several surfaces. Kernels call it in a pass of its own,
+// after that over all nodes, where few values are live: nvcc keeps values that are live across a deep call in memory.
 template <class T, int D>
-MPM_HD void apply_contact(bool wanted, const ContactArguments<T, D>& a, int scene, const int (&corner)[D], int local,
-                          Vector<T, D>& v) {
-  LoneNode<T, D> node;
-  if (wanted) node.find(a, scene, corner, local);
-  node.apply(wanted, a, local, v);
+MPM_HD_CALL void meet_several(bool wanted, const ContactArguments<T, D>& a, int scene, const int (&corner)[D],
+                              int local, Vector<T, D>& v) {
+  if (!wanted) return;
+  apply_surfaces(true, SlotPoses<T, D>(a, contact_slot(a, scene, corner)), node_position(a, corner, local), v);
 }
 
 // ---- passes over the nodes of a slot

@@ -1,7 +1,7 @@
 #pragma once
 
 #include "laws/elasticity.h"
-#include "laws/neo_hookean.h"
+#include "laws/neo_hookean_solid.h"
 
 namespace mpm {
 inline namespace TORCH_MPM_ISA {

@@ -24,7 +24,7 @@ template <class T, int D>
 struct Node {
   int slot, local;
   SlotUpdate<T, D> there;
-  LoneNode<T, D> contact;
+  NodeTouch<T, D> touch;
 
   __device__ int64_t row() const { return int64_t(slot) * kBlockNodes<D> + local; }
   __device__ bool is_in_use() const { return there.active; }
@@ -36,35 +36,87 @@ struct Node {
   __device__ void find(const NextGridArguments<T, D>& a, int at) {
     slot = at;
     there = slot_update(a.update, slot);
-    contact.touch.obstacle = NodeTouch<T, D>::none;
+    touch.obstacle = NodeTouch<T, D>::none;
   }
   __device__ void find_obstacles(const NextGridArguments<T, D>& a) {
-    contact.find(a.contact, there.scene, there.corner, local);
+    touch = lone_touch(a.contact, there.scene, there.corner, local);
   }
 };
 
-// By all threads of a warp, also of nodes that are not used.
-template <bool Obstacles, class T, int D>
-__device__ void take_node(bool used, const NextGridArguments<T, D>& a, const Node<T, D>& node) {
-  NodeRow<T, D> row{T(0), zero_vector<T, D>()};
-  if (used) row = update_node(a.update, node.there, node.local, node.sums(a));
-  if constexpr (Obstacles) node.contact.apply(row.mass != T(0), a.contact, node.local, row.value);
-  if (!used) return;
-  if (a.watched && goes_far(a.update, node.there, row)) atomicOr(&a.watched->lost, Displacement::kLost);
-  a.update.updated[node.row()] = row;
-  if (a.emptied) NodeRows<T, D>::empty(a.emptied, node.row(), a.fixed);
+template <class T, int D>
+__device__ void watch(const NextGridArguments<T, D>& a, const SlotUpdate<T, D>& there, const NodeRow<T, D>& row) {
+  if (a.watched && goes_far(a.update, there, row)) atomicOr(&a.watched->lost, Displacement::kLost);
 }
 
-// In strides of the grid, so that a mostly unused pool costs nothing: the used slots come first, and likewise those of
-// the margin. The place of the first node of a thread, and the obstacle that touches it, are found during P2G.
+// Returns whether the node meets several surfaces; it has its velocity before contact then.
 template <bool Obstacles, class T, int D>
-__global__ void __launch_bounds__(kThreads) next_grid_kernel(const __grid_constant__ NextGridArguments<T, D> a) {
-  constexpr int slots = kThreads / kBlockNodes<D>;  // at a time
-  const int first = int(blockIdx.x) * slots + int(threadIdx.x) / kBlockNodes<D>, stride = int(gridDim.x) * slots;
+__device__ bool take_node(const NextGridArguments<T, D>& a, const Node<T, D>& node) {
+  NodeRow<T, D> row = update_node(a.update, node.there, node.local, node.sums(a));
+  bool several = false;
+  if constexpr (Obstacles) {
+    several = row.mass != T(0) && node.touch.obstacle == node.touch.several;
+    if (row.mass != T(0) && node.touch.obstacle >= 0) row.value = node.touch.after(row.value);
+  }
+  if (!several) watch(a, node.there, row);
+  a.update.updated[node.row()] = row;
+  if (a.emptied) NodeRows<T, D>::empty(a.emptied, node.row(), a.fixed);
+  return several;
+}
+
+// The slots of a thread, in strides of the grid, so that a mostly unused pool costs nothing: the used slots come first,
+// and likewise those of the margin.
+struct SlotsInStrides {
+  int near, all, stride;
+
+  template <class T, int D>
+  __device__ explicit SlotsInStrides(const NextGridArguments<T, D>& a)
+      : near(a.near_blocks), all(a.update.max_blocks), stride(int(gridDim.x) * kThreads / kBlockNodes<D>) {}
+  template <int D>
+  __device__ static int first() {
+    return (int(blockIdx.x) * kThreads + int(threadIdx.x)) / kBlockNodes<D>;
+  }
+  __device__ int after(int slot, bool used) const {
+    if (used) return slot + stride;
+    return slot < near ? slot + (near - 1 - slot) / stride * stride + stride
+                       : all;  // the next one may be of the margin
+  }
+};
+
+// Contact of the nodes of a thread that meet several surfaces, from their stored velocities before that. By all threads
+// of a warp.
+template <class T, int D>
+__device__ __noinline__ void add_contact(const NextGridArguments<T, D>& a) {
+  const SlotsInStrides slots(a);
+  const int local = int(threadIdx.x) % kBlockNodes<D>;
+  int slot = slots.first<D>();
+  while (any_of_warp(slot < slots.all)) {
+    NodeRow<T, D>* const stored = a.update.updated + (int64_t(slot) * kBlockNodes<D> + local);
+    SlotUpdate<T, D> there;
+    NodeRow<T, D> row{T(0), zero_vector<T, D>()};
+    bool used = slot < slots.all;
+    if (used) there = slot_update(a.update, slot), used = there.active;
+    if (used) row = *stored;
+    bool several = row.mass != T(0);
+    if (several) several = lone_touch(a.contact, there.scene, there.corner, local).obstacle == NodeTouch<T, D>::several;
+    if (any_of_warp(several)) {
+      meet_several(several, a.contact, there.scene, there.corner, local, row.value);
+      join_warp();
+    }
+    if (several) watch(a, there, row), *stored = row;
+    if (slot < slots.all) slot = slots.after(slot, used);
+  }
+}
+
+// The place of the first node of a thread, and the obstacle that touches it, are found during P2G.
+template <bool Obstacles, class T, int D>
+__global__ void __launch_bounds__(kThreads, sizeof(T) == 4 ? 2 : 1)
+    next_grid_kernel(const __grid_constant__ NextGridArguments<T, D> a) {
+  const SlotsInStrides slots(a);
+  const int first = slots.first<D>();
   Node<T, D> node;
   node.local = int(threadIdx.x) % kBlockNodes<D>;
   int found = -1;
-  if (a.particles > 0 && first < a.update.max_blocks) {  // without particles the previous kernel is the activation
+  if (a.particles > 0 && first < slots.all) {  // without particles the previous kernel is the activation
     found = first;
     node.find(a, found);
     if (Obstacles && node.is_in_use()) node.find_obstacles(a);
@@ -74,20 +126,16 @@ __global__ void __launch_bounds__(kThreads) next_grid_kernel(const __grid_consta
     *a.next_displacement = a.displacement->next(a.particles);
     if (a.items_taken) *a.items_taken = 0;
   }
-  for (int slot = first; any_of_warp(slot < a.update.max_blocks); slot += stride) {
-    const bool exists = slot < a.update.max_blocks;
-    if (exists && slot != found) {
+  bool several = false;
+  for (int slot = first; slot < slots.all; slot = slots.after(slot, node.is_in_use())) {
+    if (slot != found) {
       node.find(a, slot);
       if (Obstacles && node.is_in_use() && node.sums(a).mass != T(0)) node.find_obstacles(a);
     }
-    const bool used = exists && node.is_in_use();
-    take_node<Obstacles>(used, a, node);
-    if (used) continue;
-    if (slot < a.near_blocks)
-      slot += (a.near_blocks - 1 - slot) / stride * stride;  // the next one may be of the margin
-    else
-      slot = a.update.max_blocks;
+    if (node.is_in_use()) several = take_node<Obstacles>(a, node) || several;
   }
+  if constexpr (Obstacles)
+    if (any_of_warp(several)) add_contact(a);
 }
 
 }  // namespace

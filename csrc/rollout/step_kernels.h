@@ -476,6 +476,7 @@ PlanFacts Substeps<T, D>::facts_of_call() const {
   f.one_deformation = has(in.F) != has(in.J);
   f.gradients = !in.resident;
   f.records = in.records;
+  f.obstacles = contact.obstacles;
   return f;
 }
 

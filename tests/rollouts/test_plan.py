@@ -40,6 +40,7 @@ CUDA = Facts(
     captured=False,
     graph_loops=True,
     path_bytes=0,
+    obstacles=0,
 )
 CPU = CUDA._replace(cuda=False, graph_loops=False)
 FEW = CUDA._replace(particles=5000, blocks_per_scene=1000, max_blocks=100)
@@ -77,6 +78,10 @@ DECISIONS = [
     (FEW, {"particles": 2**14 + 1, "deterministic": True}, "per_step", None, 64),
     (FEW, {"particles": 2**15, "max_blocks": 50}, "persistent", 1000, 1000),
     (FEW, {"particles": 2**15 + 1, "max_blocks": 50}, "per_step", None, 64),
+    (FEW, {"obstacles": 1}, "persistent", 1000, 1000),
+    (FEW, {"obstacles": 2}, "per_step", 1000, 1000),
+    (FEW, {"obstacles": 2, "particles": 2**12}, "persistent", 1000, 1000),
+    (FEW, {"obstacles": 2, "dim": 2}, "persistent", 1000, 1000),
     (FEW, {"grows": False}, "persistent", None, 1000),
     (FEW, {"grows": False, "max_blocks": 257}, "per_step", None, 1000),
     (FEW, {"grows": False, "particles": 2**14 + 1}, "per_step", None, 1000),

@@ -26,11 +26,23 @@ def serves(schedule: str, device: str, law: str, transfer: str, walls: str) -> b
     return transfer == "apic" and (schedule != "persistent" or graph_loops())
 
 
-def made(law: str, transfer: str, walls: str, obstacles: bool, device: str) -> tuple[mpm.Step, mpm.State]:
+def obstacles_of(kind: str, dim: int) -> list[mpm.Obstacle]:
+    """Nodes meet several surfaces of a corner, at first or once it has come to the particles."""
+    if kind == "sphere":
+        return [mpm.Sphere((0.4,) * dim, 0.15, friction=0.3, velocity=(1.0, -0.5, 0.2)[:dim])]
+    if kind in ("corner", "late corner"):
+        floor = mpm.Box((0.5, 0.25, 0.5)[:dim], (1.4, 0.3, 1.4)[:dim], friction=0.3)
+        speed = (20.0, 0.0, 0.0)[:dim] if kind == "late corner" else None
+        wall = mpm.Box((0.2 if speed is None else 0.05, 0.5, 0.5)[:dim], (0.3, 1.4, 1.4)[:dim], velocity=speed)
+        return [floor, wall]
+    return []
+
+
+def made(law: str, transfer: str, walls: str, obstacles: str, device: str) -> tuple[mpm.Step, mpm.State]:
     """In 2-D or 3-D, in turn."""
     dim = 2 + (list(LAWS).index(law) + list(TRANSFERS).index(transfer) + WALLS.index(walls)) % 2
-    sphere = mpm.Sphere((0.4,) * dim, 0.15, friction=0.3, velocity=(1.0, -0.5, 0.2)[:dim])
-    options = {"boundaries": [sphere] if obstacles else [], "gravity": (0.0, -9.8, 0.0)[:dim], **TRANSFERS[transfer]}
+    boundaries = obstacles_of(obstacles, dim)
+    options = {"boundaries": boundaries, "gravity": (0.0, -9.8, 0.0)[:dim], **TRANSFERS[transfer]}
     step = mpm.Step(unit_box(dim), LAWS[law](), walls=touched(walls, dim), **options)
     state = blob(device, dim, dtype=torch.float32)
     if law == "mixture":
@@ -39,7 +51,7 @@ def made(law: str, transfer: str, walls: str, obstacles: bool, device: str) -> t
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("obstacles", [False, True], ids=["", "obstacles"])
+@pytest.mark.parametrize("obstacles", ["none", "sphere", "corner", "late corner"])
 @pytest.mark.parametrize("walls", WALLS)
 @pytest.mark.parametrize("transfer", TRANSFERS)
 @pytest.mark.parametrize("law", LAWS)

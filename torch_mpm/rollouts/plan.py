@@ -88,6 +88,7 @@ class Facts(NamedTuple):
     captured: bool
     graph_loops: bool
     path_bytes: int
+    obstacles: int
 
 
 class CallPlan(NamedTuple):
@@ -457,6 +458,7 @@ def facts_of(steps: Steps, state: State, stores_all: bool = False) -> Facts:
         is_captured(x),
         x.is_cuda and graph_loops(),
         _path_bytes(step, state, dt) if step.boundaries.entries else 0,
+        len(step.boundaries.entries),
     )
 
 

@@ -58,6 +58,26 @@ struct SceneState {
   int more_room;
 };
 
+// Contact of the nodes of a scene that meet several surfaces, from their velocities before that. By all threads.
+template <class T, int D>
+__device__ __noinline__ void add_contact(const GridUpdateArguments<T, D>& update, const ContactArguments<T, D>& contact,
+                                         NodeRow<T, D>* rows, int nodes) {
+  for (int i = threadIdx.x; any_of_warp(i < nodes); i += blockDim.x) {
+    const int local = i % kBlockNodes<D>;
+    SlotUpdate<T, D> there;
+    NodeRow<T, D> row{T(0), zero_vector<T, D>()};
+    bool several = i < nodes && rows[i].mass != T(0);
+    if (several) {
+      row = rows[i], there = slot_update(update, i / kBlockNodes<D>);
+      several = lone_touch(contact, there.scene, there.corner, local).obstacle == NodeTouch<T, D>::several;
+    }
+    if (!any_of_warp(several)) continue;
+    meet_several(several, contact, there.scene, there.corner, local, row.value);
+    join_warp();
+    if (several) rows[i] = row;
+  }
+}
+
 // Spills is false if the whole scene is in shared memory; all loads and stores are then those of shared memory.
 template <class Source, class Task, bool Spills>
 class SceneStep {
@@ -453,25 +473,31 @@ class SceneStep {
       walk_columns();
   }
 
-  __device__ void update_nodes() const {
-    const int nodes = state.blocks * count, in_warps = (nodes + 31) / 32 * 32;
+  // Returns, to all threads, whether a node meets several surfaces; it has its velocity before contact then.
+  template <bool Obstacles>
+  __device__ bool update_nodes() const {
+    bool several = false;
 #pragma unroll 1
-    for (int i = threadIdx.x; i < in_warps; i += blockDim.x) {
+    for (int i = threadIdx.x; i < state.blocks * count; i += blockDim.x) {
       const int slot = i / count, local = i % count;
-      NodeRow<T, D>* const node = reinterpret_cast<NodeRow<T, D>*>(blocks.node) + i;
-      NodeRow<T, D> row{T(0), zero_vector<T, D>()};
-      SlotUpdate<T, D> there;
-      const bool has_mass = i < nodes && node->mass != T(0);
-      if (has_mass) {
-        there = slot_update(update, slot);
-        row = update_node(update, there, local, *node);
-      }
-      if (a.obstacles) apply_contact(has_mass, contact, there.scene, there.corner, local, row.value);
-      if (i >= nodes) continue;
+      NodeRow<T, D>& node = reinterpret_cast<NodeRow<T, D>*>(blocks.node)[i];
       blocks.head[i] = Rows::end;
-      *node = row;
+      if (node.mass == T(0)) {
+        node = {T(0), zero_vector<T, D>()};
+        continue;
+      }
+      const SlotUpdate<T, D> there = slot_update(update, slot);
+      NodeRow<T, D> row = update_node(update, there, local, node);
+      if constexpr (Obstacles) {
+        const NodeTouch<T, D> touch = lone_touch(contact, there.scene, there.corner, local);
+        several = several || touch.obstacle == touch.several;
+        if (touch.obstacle >= 0) row.value = touch.after(row.value);
+      }
+      node = row;
     }
+    if constexpr (Obstacles) return __syncthreads_or(several);
     __syncthreads();
+    return false;
   }
 
   // Inputs of G2P for the particles of the first round, loaded while the nodes are updated.
@@ -543,8 +569,10 @@ MPM_HD int64_t bytes_of_table(int64_t blocks) {
 
 // Computes the substeps of a scene from `step` on; returns the next one, which is not the end only for lack of shared
 // memory.
-template <class Step>
+template <bool Obstacles, class Step>
 __device__ __forceinline__ int64_t run_scene(Step& s, int64_t step) {
+  using T = typename Step::T;
+  constexpr int D = Step::D;
   s.touch_all();
   __syncthreads();
 #pragma unroll 1
@@ -555,8 +583,12 @@ __device__ __forceinline__ int64_t run_scene(Step& s, int64_t step) {
     s.report_errors(step);
     s.list_columns();
     s.walk();
-    const auto loaded = s.load_first();
-    s.update_nodes();
+    auto loaded = s.load_first();
+    if (s.template update_nodes<Obstacles>()) {
+      add_contact(s.update, s.contact, reinterpret_cast<NodeRow<T, D>*>(s.blocks.node), s.state.blocks * Step::count);
+      __syncthreads();
+      loaded = s.load_first();
+    }
     s.move_particles(loaded);
     if (threadIdx.x == 0) s.contact.time += s.a.dt, s.contact.row += s.contact.step_stride;
     move_clock(s.a, s.scene, 1);
@@ -566,8 +598,8 @@ __device__ __forceinline__ int64_t run_scene(Step& s, int64_t step) {
 }
 
 // One thread block per scene, and one for particles outside. `shared` are the bytes of dynamic shared memory.
-template <class Source, class Task, class T, int D>
-__global__ void __launch_bounds__(kMostSceneThreads)
+template <bool Obstacles, class Source, class Task, class T, int D>
+__global__ void __launch_bounds__(kMostSceneThreads, 1)
     block_per_scene_kernel(const __grid_constant__ Source source, const __grid_constant__ Task task,
                            const __grid_constant__ BlockPerSceneArguments<T, D> a, int shared) {
   using S = SceneShape<typename Source::Shape>;
@@ -619,7 +651,7 @@ __global__ void __launch_bounds__(kMostSceneThreads)
                                      Blocks(rows + row_bytes, room),
                                      update,
                                      contact};
-    step = run_scene(s, 0);
+    step = run_scene<Obstacles>(s, 0);
   }
   if (step == a.steps) return;
   const int64_t before = (state.begin + int64_t(64) * scene) * (S::row_bytes + int64_t(sizeof(int))) / 16 * 16;
@@ -636,7 +668,7 @@ __global__ void __launch_bounds__(kMostSceneThreads)
                                   Blocks(memory + table_bytes, int(left / int64_t(Blocks::bytes))),
                                   update,
                                   contact};
-  step = run_scene(s, step);
+  step = run_scene<Obstacles>(s, step);
   move_clock(a, scene, a.steps - step);
 }
 
@@ -666,8 +698,9 @@ void launch_block_per_scene(const Source& source, const Task& task, const BlockP
   const int64_t useful = together == 1 ? kMostSceneThreads : std::max<int64_t>(128, (particles + 31) / 32 * 32);
   const int threads =
       in_order ? kMostSceneThreads : int(std::min<int64_t>(kMostSceneThreads / together / 32 * 32, useful));
-  launch(block_per_scene_kernel<Source, Task, T, D>, unsigned(a.scenes + 1), unsigned(threads), size_t(shared), stream,
-         source, task, a, shared);
+  const auto kernel = a.obstacles ? block_per_scene_kernel<true, Source, Task, T, D>
+                                  : block_per_scene_kernel<false, Source, Task, T, D>;
+  launch(kernel, unsigned(a.scenes + 1), unsigned(threads), size_t(shared), stream, source, task, a, shared);
 }
 
 }  // namespace mpm::cuda

@@ -14,30 +14,16 @@
 // The barrier of the next P2G shows whether the activation still lasts. If not, that P2G is dropped; the changes by the
 // law are stored only afterwards. Where thread blocks have several items, or scenes clocks of their own, there is
 // a second barrier.
-// A substep of few particles is one chain of loads and sums that wait for each other. So the grid data
-// of an item are loaded once if a thread block has no other item, and cells have more threads in 3-D than in P2G alone.
+//
+// The search for several surfaces is a deep call, and nvcc keeps in memory what is live across one. So the first kernel
+// of scenes with obstacles has no such call: an item with a node that meets several surfaces does not complete its G2P,
+// and the kernel ends at the next barrier. A second kernel completes these items and computes the rest of the
+// activation.
+//
+// A substep of few particles is one chain of loads and sums that wait for each other. So the grid data of an item are
+// loaded once if a thread block has no other item, and cells have more threads in 3-D than in P2G alone.
 #if CUDART_VERSION >= 13000
 namespace mpm::cuda {
-
-// The velocity of nodes after grid update and contact, computed where it is read.
-template <class T, int D>
-struct NodeVelocities {
-  const GridUpdateArguments<T, D>& update;
-  const ContactArguments<T, D>& contact;
-  bool obstacles;
-  NodeRows<T, D> nodes;
-
-  // By all threads of a warp; zero where not wanted.
-  __device__ Vector<T, D> at(bool wanted, const SlotUpdate<T, D>& there, int slot, int local) const {
-    NodeRow<T, D> node{T(0), zero_vector<T, D>()};
-    if (wanted) node = nodes.at(int64_t(slot) * kBlockNodes<D> + local);
-    const bool has_mass = node.mass != T(0);
-    Vector<T, D> v = zero_vector<T, D>();
-    if (has_mass) v = update_node(update, there, local, node).value;
-    if (obstacles) apply_contact(has_mass, contact, there.scene, there.corner, local, v);
-    return v;
-  }
-};
 
 // P2G with threads that share the particles of a cell and leading node.
 template <class S>
@@ -56,17 +42,142 @@ struct ItemMemory {
   int row[most], base[most];  // rows of their contributions, and their base nodes, -1 without one
 };
 
+template <class T, int D>
+__device__ void store(const Vector<T, D>& v, NodeValue<T, D>& value) {
+  value = {};
+#pragma unroll
+  for (int axis = 0; axis < D; axis++) value.e[axis] = v[axis];
+}
+
+// The contacts that a kernel computes.
+enum class Contacts { none, one_surface, several_surfaces };
+
+struct TileNode {
+  int place;           // in the tile, or beyond that in the support of a particle out of block; -1 outside the grid
+  int slot = -1;       // -1 where it has none
+  int local = 0;       // in its slot
+  int neighbour = -1;  // of the block of the item; -1 of a particle out of block
+};
+
+// The nodes that an item reads: those of its tile, and then those of the supports of `out_of_block` particles.
+template <class S>
+struct TileNodes {
+  using T = typename S::T;
+  static constexpr int D = S::D, Order = S::Order, width = kBlockWidth + Order;
+  static constexpr int tile = D == 2 ? width * width : width * width * width;
+  // The support of a particle out of block has the row length of the tile, so that G2P treats both alike.
+  static constexpr int support = S::support * S::slab,
+                       span = (D == 2 ? 0 : Order * width * width) + Order * width + Order + 1;
+
+  const ItemMemory<S>& m;
+  const int* neighbours;
+  int first_out_of_block, of_tile, out_of_block;
+
+  __device__ int count() const { return of_tile + out_of_block * support; }
+
+  __device__ TileNode at(int i) const {
+    int offset[D], base = 0;
+    TileNode node;
+    const int* slots = m.slots;
+    const bool of_particle = i >= of_tile;
+    if (of_particle) {
+      const int s = (i - of_tile) / support;
+      split<Order + 1>((i - of_tile) % support, offset);
+      node.place = tile + s * span + in_tile(offset);
+      base = m.base[first_out_of_block + s];
+      slots = neighbours + (int64_t(base / kBlockNodes<D>) << D);
+      if (base < 0) node.place = -1;
+    } else {
+      split<width>(i, offset);
+      node.place = i;
+    }
+    int at[D], neighbour = 0;
+#pragma unroll
+    for (int axis = D - 1, rest = base; axis >= 0; axis--, rest /= kBlockWidth) {
+      at[axis] = (of_particle ? rest % kBlockWidth : 0) + offset[axis];
+      neighbour |= (at[axis] >= kBlockWidth) << (D - 1 - axis);
+    }
+    if (node.place >= 0) node.slot = slots[neighbour];
+    node.local = node_in_block<D>(at);
+    if (!of_particle) node.neighbour = neighbour;
+    return node;
+  }
+  __device__ SlotUpdate<T, D> update_of(const TileNode& node, const GridUpdateArguments<T, D>& update) const {
+    return node.neighbour < 0 ? slot_update(update, node.slot) : m.there[node.neighbour];
+  }
+
+  template <int Width>
+  __device__ static void split(int i, int (&offset)[D]) {
+#pragma unroll
+    for (int axis = D - 1; axis >= 0; axis--, i /= Width) offset[axis] = i % Width;
+  }
+  __device__ static int in_tile(const int (&offset)[D]) {
+    int place = 0;
+#pragma unroll
+    for (int axis = 0; axis < D; axis++) place = place * width + offset[axis];
+    return place;
+  }
+};
+
+// The velocity of nodes after the grid update and contact with one surface, computed where it is read.
+template <Contacts C, class T, int D>
+struct NodeVelocities {
+  const GridUpdateArguments<T, D>& update;
+  const ContactArguments<T, D>& contact;
+  NodeRows<T, D> nodes;
+
+  // Of a node that meets several surfaces, that before contact; `several` is set.
+  __device__ Vector<T, D> at(const SlotUpdate<T, D>& there, const TileNode& place, bool& several) const {
+    const NodeRow<T, D> node = row(place);
+    if (node.mass == T(0)) return zero_vector<T, D>();
+    const Vector<T, D> v = update_node(update, there, place.local, node).value;
+    if constexpr (C == Contacts::none) return v;
+    const NodeTouch<T, D> touch = touch_of(there, place);
+    several = several || touch.obstacle == touch.several;
+    return touch.obstacle >= 0 ? touch.after(v) : v;
+  }
+  __device__ NodeRow<T, D> row(const TileNode& place) const {
+    return nodes.at(int64_t(place.slot) * kBlockNodes<D> + place.local);
+  }
+  __device__ NodeTouch<T, D> touch_of(const SlotUpdate<T, D>& there, const TileNode& place) const {
+    return lone_touch(contact, there.scene, there.corner, place.local);
+  }
+};
+
+// Contact of the nodes that meet several surfaces, from their velocities before that. By all threads.
+template <class S, class T, int D>
+__device__ __noinline__ void add_contact(const TileNodes<S>& nodes,
+                                         const NodeVelocities<Contacts::several_surfaces, T, D>& velocities,
+                                         NodeValue<T, D>* tile) {
+  const auto& contact = velocities.contact;
+  for (int i = threadIdx.x; any_of_warp(i < nodes.count()); i += S::threads) {
+    TileNode node{-1};
+    if (i < nodes.count()) node = nodes.at(i);
+    SlotUpdate<T, D> there;
+    Vector<T, D> v = zero_vector<T, D>();
+    bool several = node.slot >= 0 && velocities.row(node).mass != T(0);
+    if (several) {
+      there = nodes.update_of(node, velocities.update);
+#pragma unroll
+      for (int axis = 0; axis < D; axis++) v[axis] = tile[node.place].e[axis];
+      several = velocities.touch_of(there, node).obstacle == NodeTouch<T, D>::several;
+    }
+    if (!any_of_warp(several)) continue;
+    meet_several(several, contact, there.scene, there.corner, node.local, v);
+    join_warp();
+    if (several) store(v, tile[node.place]);
+  }
+}
+
 // The phases of a substep of one item, whose particles have a thread each.
 template <class Source, class Task>
 class ItemStep {
  public:
   using S = SharingShape<typename Source::Shape>;
   using T = typename S::T;
-  static constexpr int D = S::D, Order = Task::Order, width = kBlockWidth + Order, threads = S::threads;
-  static constexpr int tile_nodes = D == 2 ? width * width : width * width * width;
-  // The support of a particle out of block has the row length of the tile, so that G2P treats both alike.
-  static constexpr int support_nodes = S::support * S::slab,
-                       span = (D == 2 ? 0 : Order * width * width) + Order * width + Order + 1;
+  static constexpr int D = S::D, Order = Task::Order, threads = S::threads;
+  static constexpr int tile_nodes = TileNodes<S>::tile, span = TileNodes<S>::span;
+  static_assert(Order == S::Order);
   static constexpr int out_of_block_at_once = (int(S::shared_bytes / sizeof(NodeValue<T, D>)) - tile_nodes) / span;
   static_assert(threads >= persistent_item<D>(kMostPersistentParticles) && S::batch >= threads &&
                 out_of_block_at_once > 0);
@@ -142,19 +253,21 @@ class ItemStep {
     empty_lists<S>(m.head);
   }
 
-  // G2P of the particles; `found` if link() has located them.
-  __device__ void gather(const NodeVelocities<T, D>& velocities, bool found, FollowerOf<Task>& follower) {
+  // G2P of the particles; `found` if link() has located them. Returns false, to all threads, where no particle has
+  // moved, because a node meets several surfaces and C is one_surface.
+  template <Contacts C>
+  __device__ bool gather(const NodeVelocities<C, T, D>& velocities, bool found, FollowerOf<Task>& follower) {
     NodeValue<T, D>* const tile = reinterpret_cast<NodeValue<T, D>*>(memory);
     if (!found) {
       if (exists_) find();
       __syncthreads();
     }
     const int out_of_block = m.out_of_block;
+    if (C == Contacts::one_surface && out_of_block > out_of_block_at_once) return false;
     int first = 0;
     do {
       const int count = ::min(out_of_block - first, out_of_block_at_once);
-      load_velocities(velocities, tile, first, first == 0 ? tile_nodes : 0, count);
-      __syncthreads();
+      if (!load_velocities(velocities, tile, first, first == 0 ? tile_nodes : 0, count)) return false;
       const bool mine = out_of_block_ < 0 ? first == 0 : out_of_block_ >= first && out_of_block_ < first + count;
       if (exists_ && mine)
         move(out_of_block_ < 0 ? tile + corner() : tile + tile_nodes + (out_of_block_ - first) * span, follower);
@@ -163,6 +276,7 @@ class ItemStep {
     } while (first < out_of_block);
     if (threadIdx.x == 0) m.out_of_block = 0;
     __syncthreads();
+    return true;
   }
 
  private:
@@ -187,63 +301,32 @@ class ItemStep {
       if (m.base[s] >= 0) add_one_out_of_block(nodes, schedule_of(topology()), shared, m.row[s], m.base[s]);
   }
 
-  template <int Width>
-  __device__ static void split(int i, int (&offset)[D]) {
-#pragma unroll
-    for (int axis = D - 1; axis >= 0; axis--, i /= Width) offset[axis] = i % Width;
-  }
-
-  __device__ static int in_tile(const int (&offset)[D]) {
-    int place = 0;
-#pragma unroll
-    for (int axis = 0; axis < D; axis++) place = place * width + offset[axis];
-    return place;
-  }
-
-  // Computes the velocities of the first nodes of the tile, and of the supports of `count` particles out of block.
-  __device__ void load_velocities(const NodeVelocities<T, D>& velocities, NodeValue<T, D>* tile, int first_out_of_block,
-                                  int of_tile, int count) const {
-    const int nodes = of_tile + count * support_nodes, in_warps = (nodes + 31) / 32 * 32;
+  // Computes the velocities of the first nodes of the tile, and of the supports of `count` particles out of block. By
+  // all threads; false as gather().
+  template <Contacts C>
+  __device__ bool load_velocities(const NodeVelocities<C, T, D>& velocities, NodeValue<T, D>* tile,
+                                  int first_out_of_block, int of_tile, int count) const {
+    const TileNodes<S> nodes{m, schedule_of(topology()).neighbours, first_out_of_block, of_tile, count};
+    bool several = false;
 #pragma unroll 1
-    for (int i = threadIdx.x; i < in_warps; i += threads) {
-      const bool exists = i < nodes;
-      int offset[D], base = 0, place = i;
-      const int* slots = m.slots;
-      const bool is_out_of_block = i >= of_tile;
-      if (!exists) {
-        base = -1;
-      } else if (is_out_of_block) {
-        const int s = (i - of_tile) / support_nodes;
-        split<Order + 1>((i - of_tile) % support_nodes, offset);
-        place = tile_nodes + s * span + in_tile(offset);
-        base = m.base[first_out_of_block + s];
-        slots = schedule_of(topology()).neighbours + (int64_t(base / kBlockNodes<D>) << D);
-      } else {
-        split<width>(i, offset);
-      }
-      const bool found = base >= 0;
-      int node[D], neighbour = 0;
-#pragma unroll
-      for (int axis = D - 1, rest = base; axis >= 0; axis--, rest /= kBlockWidth) {
-        node[axis] = (is_out_of_block ? rest % kBlockWidth : 0) + offset[axis];
-        neighbour |= (node[axis] >= kBlockWidth) << (D - 1 - axis);
-      }
-      const int slot = found ? slots[neighbour] : -1;
-      SlotUpdate<T, D> there;
-      if (slot >= 0) there = is_out_of_block ? slot_update(update, slot) : m.there[neighbour];
-      const Vector<T, D> v = velocities.at(slot >= 0, there, slot, node_in_block<D>(node));
-      if (!found) continue;
-      NodeValue<T, D> value{};
-#pragma unroll
-      for (int axis = 0; axis < D; axis++) value.e[axis] = v[axis];
-      tile[place] = value;
+    for (int i = threadIdx.x; i < nodes.count(); i += threads) {
+      const TileNode node = nodes.at(i);
+      if (node.place < 0) continue;
+      Vector<T, D> v = zero_vector<T, D>();
+      if (node.slot >= 0) v = velocities.at(nodes.update_of(node, update), node, several);
+      store(v, tile[node.place]);
     }
+    if constexpr (C == Contacts::one_surface) return !__syncthreads_or(several);
+    if constexpr (C == Contacts::several_surfaces)
+      if (__syncthreads_or(several)) add_contact(nodes, velocities, tile);
+    __syncthreads();
+    return true;
   }
 
   __device__ int corner() const {
     int offset[D];
-    split<kBlockWidth>(cell_, offset);
-    return in_tile(offset);
+    TileNodes<S>::template split<kBlockWidth>(cell_, offset);
+    return TileNodes<S>::in_tile(offset);
   }
 
   __device__ void move(const NodeValue<T, D>* corner, FollowerOf<Task>& follower) {
@@ -322,6 +405,8 @@ class CountingBarrier {
   }
 
   __device__ Displacement* counted() { return counted_ + turn_; }
+  // Those of the previous barrier.
+  __device__ const Displacement* counted_before() const { return counted_ + (1 - turn_); }
   // Returns the sum of the counters of all thread blocks since the previous barrier.
   __device__ Displacement wait() {
     Displacement* const mine = counted();
@@ -363,7 +448,7 @@ class CountingBarrier {
   int turn_ = 0, out_of_block_before_ = 0, out_of_block_before_last_ = 0;
 };
 
-template <class Source, class Task, class T, int D>
+template <Contacts C, class Source, class Task, class T, int D>
 __global__ void __launch_bounds__(ItemStep<Source, Task>::threads, kItemsOfProcessor<D>)
     persistent_kernel(const __grid_constant__ Source source, const __grid_constant__ Task task,
                       const __grid_constant__ PersistentLoop<T, D> a) {
@@ -375,22 +460,53 @@ __global__ void __launch_bounds__(ItemStep<Source, Task>::threads, kItemsOfProce
   __shared__ Displacement counted[2];
   __shared__ alignas(16) char contact_memory[sizeof(ContactArguments<T, D>)];
   grid_dependency_sync();
+  if (C == Contacts::several_surfaces && a.handover->steps == 0) return;
   const Topology<T, D>& t = source.topology;
   const bool cluster = is_cluster();
   const int items = *schedule_of(t).item_count, first = *a.steps_so_far;
   const int blocks = cluster ? int(gridDim.x) : ::max(1, ::min(items, int(gridDim.x)));
   const bool leads = blockIdx.x == 0 && threadIdx.x == 0, alone = items <= blocks;
-  if (first >= a.steps && leads && a.loop) cudaGraphSetConditional(a.loop, 0);
-  if (first >= a.steps || int(blockIdx.x) >= blocks) return;
+  const bool continues = C == Contacts::several_surfaces && a.handover->requested;
+  if (first >= a.steps && !continues && leads && a.loop) cudaGraphSetConditional(a.loop, 0);
+  if ((first >= a.steps && !continues) || int(blockIdx.x) >= blocks) return;
+  if (C == Contacts::one_surface && (!alone || a.scene_time)) {
+    if (leads) a.handover->steps = 1;
+    return;
+  }
   auto& contact = *reinterpret_cast<ContactArguments<T, D>*>(contact_memory);
-  if (threadIdx.x == 0 && a.obstacles) contact = a.contact;
+  if (C != Contacts::none && threadIdx.x == 0) contact = a.contact;
   if (threadIdx.x == 32) of_margin = used_slots(t, a.blocks, t.max_blocks);
   __syncthreads();
   const UsedNodes<T, D> used(::min(a.activated[kBlocksNow], a.blocks), of_margin, a.blocks);
   CountingBarrier barrier(a.arrived, blocks, cluster, counted);
   Step item(source, task, a.update, shared, memory);
-  const bool keeps = alone && int(blockIdx.x) < items;  // an item of its own
-  if (keeps) item.begin(blockIdx.x), item.load(), item.link();
+  const auto lasts = [&](const Displacement& all) {
+    return all.lost == 0 && all.out_of_block * kParticlesPerOutOfBlock <= t.particles;
+  };
+  const auto set_contact = [&](int step) {
+    if (C == Contacts::none || threadIdx.x > 0) return;
+    if (a.step_time) contact.time = a.step_time[step];
+    contact.row = a.contact.row + step * a.contact.step_stride;
+  };
+  const auto velocities = [&](int step) {
+    return NodeVelocities<C, T, D>{
+        a.update, contact, {reinterpret_cast<const NodeRow<T, D>*>(a.nodes[step % 3]), source.nodes.fixed}};
+  };
+  const bool has_item = int(blockIdx.x) < items, keeps = alone && has_item;  // an item of its own
+  bool more = true;
+  if constexpr (C == Contacts::several_surfaces) {
+    if (continues) {  // G2P of items that the other kernel has not completed
+      FollowerOf<Task> follower;
+      set_contact(first - 1);
+      if (has_item && a.handover->incomplete[blockIdx.x]) {
+        item.begin(blockIdx.x);
+        item.gather(velocities(first - 1), false, follower);
+      }
+      follower.flush_counters(barrier.counted());
+      more = lasts(barrier.wait()) && !a.handover->lost && first < a.steps;
+    }
+  }
+  if (keeps && more) item.begin(blockIdx.x), item.load(), item.link();
   const auto each_item = [&](const auto& phase) {
     for (int i = blockIdx.x; i < items; i += blocks) {
       if (!alone) item.begin(i);
@@ -402,45 +518,43 @@ __global__ void __launch_bounds__(ItemStep<Source, Task>::threads, kItemsOfProce
   const auto each_outside = [&](const auto& skip) {
     for (int64_t i = tail; i < t.particles; i += int64_t(blocks) * threads) skip(t.index[i]);
   };
-  const auto lasts = [&](const Displacement& all) {
-    return all.lost == 0 && all.out_of_block * kParticlesPerOutOfBlock <= t.particles;
-  };
   const bool ahead = alone && !a.scene_time;
   int step = first;
-  for (bool more = true; more;) {
+  bool complete = true;
+  while (more) {
+    set_contact(step);
     used.empty(a.nodes[(step + 1) % 3], source.nodes.fixed, blocks);
     each_item([&] {
       if (!alone) item.load(), item.link(), item.keep();
-      item.scatter(a.nodes[step % 3]);
+      if (complete) item.scatter(a.nodes[step % 3]);
     });
-    if (threadIdx.x == 0 && a.step_time) contact.time = a.step_time[step];
-    if (threadIdx.x == 0 && a.obstacles) contact.row = a.contact.row + step * a.contact.step_stride;
     if (!lasts(barrier.wait())) break;
 
     if (keeps) item.keep();
     each_outside([&](int p) { source.skip(p); });
-    const NodeVelocities<T, D> velocities{
-        a.update,
-        contact,
-        a.obstacles,
-        {reinterpret_cast<const NodeRow<T, D>*>(a.nodes[step % 3]), source.nodes.fixed}};
     FollowerOf<Task> follower;
-    each_item([&] { item.gather(velocities, alone, follower); });
+    each_item([&] { complete = item.gather(velocities(step), alone, follower); });
     each_outside([&](int p) { task.skip(p); });
     follower.flush_counters(barrier.counted());
+    if (C == Contacts::one_surface && !complete && threadIdx.x == 0) a.handover->request(*barrier.counted());
     step++;
     more = step < a.steps && step - first < kStepsOfALaunch;
-    if (keeps && more) item.link();  // of the next substep
+    if (keeps && more && complete) item.link();  // of the next substep
     if (ahead && more) continue;
     more = lasts(barrier.wait()) && more;
     if (blockIdx.x == 0 && a.scene_time)
       for (int b = threadIdx.x; b < t.scenes; b += threads) a.scene_time[b] += a.update.dt * double(a.scene_dt[b]);
   }
-  for (T* nodes : a.nodes) used.empty(nodes, source.nodes.fixed, blocks);
-  if (blockIdx.x == 0) write_persistent_status(a, t.scenes, step - first);
+  const bool hands_over = C == Contacts::one_surface && a.handover->is_requested();
+  if (hands_over && threadIdx.x == 0) a.handover->end(*barrier.counted_before());
+  for (T* const nodes : a.nodes)
+    if (!hands_over || nodes != a.nodes[(step + 2) % 3]) used.empty(nodes, source.nodes.fixed, blocks);
+  const int before = C == Contacts::several_surfaces ? a.handover->steps - 1 : 0;
+  if (blockIdx.x == 0) write_persistent_status(a, t.scenes, before + step - first);
   if (cluster) wait_for_cluster();  // other blocks may still read the counters of this one
   if (!leads) return;
   *a.steps_so_far = step;
+  if (hands_over) a.handover->steps = 1 + step - first;
   a.displacement->lost = Displacement::kLost;  // requests a new activation
   if (a.loop) cudaGraphSetConditional(a.loop, step < a.steps);
 }
@@ -450,8 +564,15 @@ void launch_persistent(const Source& source, const Task& task, const PersistentA
   using Step = ItemStep<Source, Task>;
   const int64_t particles = source.topology.particles, items = most_items(source.topology.max_blocks, particles);
   const int64_t most = particles <= kMostClusterParticles ? kLargestCluster : items;
-  launch_at_once(persistent_kernel<Source, Task, T, D>, unsigned(std::min(items, most)), Step::threads,
-                 Step::S::shared_bytes, stream, source, task, static_cast<const PersistentLoop<T, D>&>(a));
+  const auto launch_kernel = [&](auto kernel, PersistentLoop<T, D> loop) {
+    launch_at_once(kernel, unsigned(std::min(items, most)), Step::threads, Step::S::shared_bytes, stream, source, task,
+                   loop);
+  };
+  if (!a.obstacles) return launch_kernel(persistent_kernel<Contacts::none, Source, Task, T, D>, a);
+  launch_kernel(persistent_kernel<Contacts::one_surface, Source, Task, T, D>, a);
+  PersistentLoop<T, D> rest = a;
+  rest.arrived = a.arrived + 2;
+  launch_kernel(persistent_kernel<Contacts::several_surfaces, Source, Task, T, D>, rest);
 }
 
 }  // namespace mpm::cuda

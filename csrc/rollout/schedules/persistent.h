@@ -20,6 +20,32 @@ constexpr int kStepsOfALaunch = 2048;  // at most
 template <int D>
 constexpr int kItemsOfProcessor = D == 2 ? 2 : 1;
 
+constexpr int kMostPersistentItems = 1024;  // of thread blocks that run at once
+
+// What the kernel for nodes that meet one surface leaves to that for several. Zero before each activation.
+struct Handover {
+  int requested;
+  int lost;   // whether the activation has lost a particle
+  int steps;  // 1 + substeps of the activation that the other kernel has computed; 0 where this one has nothing to do
+  int incomplete[kMostPersistentItems];  // whether the G2P of the last substep has yet to be computed, of each item
+
+#ifdef __CUDACC__
+  // By a thread of a thread block with an incomplete item. Its displacement stops all thread blocks at the next
+  // barrier.
+  __device__ void request(Displacement& displacement) {
+    incomplete[blockIdx.x] = 1;
+    atomicOr(&requested, 1);
+    atomicOr(&displacement.lost, kRequest);
+  }
+  // By all thread blocks after that barrier, with their displacement before it.
+  __device__ bool is_requested() const { return *const_cast<const volatile int*>(&requested); }
+  __device__ void end(const Displacement& displacement) {
+    if (displacement.lost & ~kRequest) atomicOr(&lost, 1);
+  }
+  static constexpr int kRequest = 1 << 8;  // beside Displacement::Loss
+#endif
+};
+
 // Arguments of the kernel beside those of P2G and G2P. Nodes are zero before and after.
 template <class T, int D>
 struct PersistentLoop {
@@ -33,7 +59,8 @@ struct PersistentLoop {
   double* scene_time = nullptr;           // [scenes], advanced in each substep
   const T* scene_dt = nullptr;            // [scenes]
   int* steps_so_far = nullptr;            // zeroed before a call
-  unsigned long long* arrived = nullptr;  // counters of barriers, two words zeroed before each launch
+  unsigned long long* arrived = nullptr;  // counters of barriers, two words of each kernel, zeroed before each launch
+  Handover* handover = nullptr;           // for obstacles
   Displacement* displacement = nullptr;   // requests a new activation
   const int* activated = nullptr;         // status of the activation, [1 + scenes, 8]
   int* status = nullptr;                  // status of all substeps

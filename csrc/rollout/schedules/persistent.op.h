@@ -30,10 +30,12 @@ bool run_persistent(Substeps<T, D>& s, int* activated, int* status, backend::Str
   a.contact.activations = nullptr;
   a.contact.row += a.contact.step_stride;
   give_clocks(s, a);
-  Tensor steps_so_far = empty_int(in.x, {1}), arrived = empty(in.x, {2}, ScalarType::Long);
+  constexpr int64_t kWords = 4 + (sizeof(Handover) + 7) / 8;
+  Tensor steps_so_far = empty_int(in.x, {1}), arrived = empty(in.x, {kWords}, ScalarType::Long);
   backend::clear(steps_so_far, stream);
   a.steps_so_far = static_cast<int*>(steps_so_far.data_ptr());
   a.arrived = static_cast<unsigned long long*>(arrived.data_ptr());
+  a.handover = reinterpret_cast<Handover*>(a.arrived + 4);
   a.displacement = s.advance.displacement;
   a.activated = activated;
   a.status = status;
