@@ -31,10 +31,9 @@ def obstacles_of(kind: str, dim: int) -> list[mpm.Obstacle]:
     if kind == "sphere":
         return [mpm.Sphere((0.4,) * dim, 0.15, friction=0.3, velocity=(1.0, -0.5, 0.2)[:dim])]
     if kind in ("corner", "late corner"):
+        x, speed = (0.2, 0.0) if kind == "corner" else (0.05, 20.0)
         floor = mpm.Box((0.5, 0.25, 0.5)[:dim], (1.4, 0.3, 1.4)[:dim], friction=0.3)
-        speed = (20.0, 0.0, 0.0)[:dim] if kind == "late corner" else None
-        wall = mpm.Box((0.2 if speed is None else 0.05, 0.5, 0.5)[:dim], (0.3, 1.4, 1.4)[:dim], velocity=speed)
-        return [floor, wall]
+        return [floor, mpm.Box((x, 0.5, 0.5)[:dim], (0.3, 1.4, 1.4)[:dim], velocity=(speed, 0.0, 0.0)[:dim])]
     return []
 
 
