@@ -9,8 +9,9 @@
 //     }
 // The machine code of nvcc 13.0 gives barriers of convergence up where a branch contains a deep call. The threads of a
 // warp then leave the branch at different times. Values that are common to a warp, as the counters of its loops, are
-// overwritten or increment twice. All threads of the warp that have not returned from the kernel call both functions.
-// On the CPU, a warp is one thread.
+// overwritten or increment twice. A function that is called so and calls another one does the same: it has no branch
+// around that call but for a condition of `any_of_warp`. All threads of the warp that have not returned from the kernel
+// call both functions. On the CPU, a warp is one thread.
 
 // A call keeps the registers and instructions of what few nodes need out of the loops over all others.
 #if defined(__CUDACC__)

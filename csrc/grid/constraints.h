@@ -34,7 +34,7 @@ struct Constraints {
 
 // Solves the system of a positive definite matrix of order n in place; false where it is nearly singular.
 template <class S, int D>
-MPM_HD_CALL bool solve_definite(S (&g)[D][D], S (&x)[D], int n) {
+MPM_HD bool solve_definite(S (&g)[D][D], S (&x)[D], int n) {
   constexpr double least = 1e-3;  // of the square of the sine between unit vectors
   for (int k = 0; k < n; k++) {
     if (!(g[k][k] > S(least))) return false;

@@ -111,16 +111,16 @@ class NearestSurface {
 // The least deep obstacle that a position is in, −1 for none. Of equally deep ones the stricter counts, and then that
 // of more friction, as `SolidAt` has it.
 template <class T, int D>
-MPM_HD int obstacle_around(const SlotPoses<T, D>& poses, const Vector<T, D>& x) {
+MPM_HD int obstacle_around(bool wanted, const SlotPoses<T, D>& poses, const Vector<T, D>& x) {
   const auto& a = poses.a;
   int found = -1;
   T least = T(0);
-  for (uint64_t left = poses.s.near; left; left &= left - 1) {
+  for (uint64_t left = wanted ? poses.s.near : 0; any_of_warp(left != 0); left &= left - 1) {
     const int k = lowest_bit(left);
     Vector<T, D> normal;
     T beyond;
-    const T distance = height_above(poses, k, -1, x, normal, beyond);
-    if (!(distance <= a.rounding)) continue;
+    const T distance = height_above(left != 0, poses, k, -1, x, normal, beyond);
+    if (!left || !(distance <= a.rounding)) continue;
     const T depth = rounded_depth(a, T(0) - distance);
     if (found >= 0 && depth > least) continue;
     if (found >= 0 && depth == least) {
@@ -133,37 +133,38 @@ MPM_HD int obstacle_around(const SlotPoses<T, D>& poses, const Vector<T, D>& x) 
   return found;
 }
 
+// Adds the faces that a node inside obstacle `inside` meets; a negative one adds none.
 template <class T, int D>
 MPM_HD void find_in_solid(const SlotPoses<T, D>& poses, int inside, NodeContact<T, D>& c) {
   const auto& a = poses.a;
   SolidAt<T, D> solid(poses, c.position);
-  solid.find();
+  solid.find(inside >= 0);
   const auto& foot = solid.foot();
   for (int i = 0; i < foot.count; i++) {
     const auto& face = solid.face(i);
     const bool frozen = face.flat && a.kind[face.obstacle].shape == ObstacleShape::sampled;
     c.add(face.obstacle, face.face, frozen ? face.at : c.position);
   }
-  if (foot.count == 0) c.add(inside, -1, c.position);  // deep inside
+  if (inside >= 0 && foot.count == 0) c.add(inside, -1, c.position);  // deep inside
 }
 
 template <class T, int D>
 MPM_HD_CALL void find_surfaces(bool wanted, const SlotPoses<T, D>& poses, const Vector<T, D>& position,
                                NodeContact<T, D>& c) {
-  if (!wanted) return;
   const auto& a = poses.a;
   c.position = within_walls(a, position, T(0), c.sign);
-  int around = obstacle_around(poses, c.position);
+  int around = obstacle_around(wanted, poses, c.position);
   const T near = NearestSurface<T, D>::near_wall(a);
-  for (int face = 0; face < 2 * D; face++)
+  for (int face = 0; wanted && face < 2 * D; face++)
     if (a.wall_kind[face] != Contact::open && wall_height(a, face, c.position) <= near) c.walls |= 1u << face;
-  if (around < 0 && c.walls) {  // a gap between an obstacle and a wall
+  const bool in_gap = wanted && around < 0 && c.walls;  // between an obstacle and a wall
+  if (any_of_warp(in_gap)) {
     Vector<T, D> sign;
     const Vector<T, D> beside = within_walls(a, position, SolidAt<T, D>::seam_of(a), sign);
-    around = obstacle_around(poses, beside);
-    if (around >= 0) c.position = beside;
+    const int there = obstacle_around(in_gap, poses, beside);
+    if (there >= 0) around = there, c.position = beside;
   }
-  if (around >= 0) find_in_solid(poses, around, c);
+  if (any_of_warp(around >= 0)) find_in_solid(poses, around, c);
 }
 
 // ---- any node
@@ -258,9 +259,9 @@ MPM_HD Vector<T, D> reflected(const Vector<T, D>& sign, Vector<T, D> v) {
 template <class T, int D>
 MPM_HD_CALL void apply_surfaces(bool wanted, const SlotPoses<T, D>& poses, const Vector<T, D>& position,
                                 Vector<T, D>& v) {
-  if (!wanted) return;
   NodeContact<T, D> contact;
-  find_surfaces(true, poses, position, contact);
+  find_surfaces(wanted, poses, position, contact);
+  join_warp();
   if (contact.count == 0) return;
   Constraints<T, D> constraints;
   find_constraints(poses, contact, constraints);
@@ -288,13 +289,27 @@ MPM_HD NodeTouch<T, D> lone_touch(const ContactArguments<T, D>& a, int scene, co
   return nearest.found(slot.walled);
 }
 
-// Replaces the velocity of a node by that after contact with several surfaces. Kernels call it in a pass of its own,
-// after that over all nodes, where few values are live: nvcc keeps values that are live across a deep call in memory.
 template <class T, int D>
-MPM_HD_CALL void meet_several(bool wanted, const ContactArguments<T, D>& a, int scene, const int (&corner)[D],
-                              int local, Vector<T, D>& v) {
-  if (!wanted) return;
-  apply_surfaces(true, SlotPoses<T, D>(a, contact_slot(a, scene, corner)), node_position(a, corner, local), v);
+MPM_HD_CALL void apply_several(bool wanted, const ContactArguments<T, D>& a, int scene, const int (&corner)[D],
+                               int local, Vector<T, D>& v) {
+  ContactSlot<T, D> slot;
+  if (wanted) slot = contact_slot(a, scene, corner);
+  apply_surfaces(wanted, SlotPoses<T, D>(a, slot), node_position(a, corner, local), v);
+}
+
+// Replaces the velocity of a node that meets several surfaces by that after contact, and returns whether it does. By
+// all threads of a warp, as `any_of_warp`. Kernels call it in a pass of its own, after that over all nodes, where few
+// values are live: nvcc keeps values that are live across a deep call in memory.
+template <class T, int D>
+MPM_HD bool meet_several(bool wanted, const ContactArguments<T, D>& a, int scene, const int (&corner)[D], int local,
+                         Vector<T, D>& v) {
+  bool several = wanted;
+  if (several) several = lone_touch(a, scene, corner, local).obstacle == NodeTouch<T, D>::several;
+  if (any_of_warp(several)) {
+    apply_several(several, a, scene, corner, local, v);
+    join_warp();
+  }
+  return several;
 }
 
 // ---- passes over the nodes of a slot

@@ -165,15 +165,30 @@ class SlotPoses {
 #endif
 };
 
-// Height of a point of the world above the surface that carries a face of obstacle k, and the unit normal of that; see
-// `face_height`.
 template <class T, int D>
-MPM_HD_CALL T height_above(const SlotPoses<T, D>& poses, int k, int face, const Vector<T, D>& x, Vector<T, D>& normal,
-                           T& beyond) {
+MPM_HD_CALL void compute_height(bool wanted, const SlotPoses<T, D>& poses, int k, int face, const Vector<T, D>& x,
+                                T& height, Vector<T, D>& normal, T& beyond) {
+  if (!wanted) return;
   const auto& pose = poses[k];
   Vector<T, D> own;
-  const T height = face_height(pose, face, to_body(pose, x), own, beyond);
+  height = face_height(pose, face, to_body(pose, x), own, beyond);
   normal = pose.rotation * own;
+}
+
+// Height of a point of the world above the surface that carries a face of obstacle k, and the unit normal of that; see
+// `face_height`. Zero where it is not wanted.
+//
+// The threads of a warp compute heights together, as common/warp.h has it. So all functions from here to the end of the
+// search for surfaces are called by all threads of a warp, with `wanted` for those whose node needs the result. They
+// have no branch around a call but for conditions of `any_of_warp`.
+template <class T, int D>
+MPM_HD T height_above(bool wanted, const SlotPoses<T, D>& poses, int k, int face, const Vector<T, D>& x,
+                      Vector<T, D>& normal, T& beyond) {
+  T height = T(0);
+  if (any_of_warp(wanted)) {
+    compute_height(wanted, poses, k, face, x, height, normal, beyond);
+    join_warp();
+  }
   return height;
 }
 
@@ -226,10 +241,15 @@ class SolidAt {
   }
 
   // Finds the faces that the node meets; their number is zero where none is near enough.
-  MPM_HD void find() {
-    for (uint64_t left = poses_.s.near; left; left &= left - 1) add_faces(lowest_bit(left));
+  MPM_HD void find(bool wanted) {
+    for (uint64_t left = wanted ? poses_.s.near : 0; any_of_warp(left != 0); left &= left - 1)
+      add_faces(left != 0, lowest_bit(left));
     Foot<T, D> foot;
-    while (next_set(foot)) try_foot(foot);
+    while (true) {
+      wanted = wanted && next_set(foot);
+      if (!any_of_warp(wanted)) break;
+      try_foot(wanted, foot);
+    }
   }
 
   MPM_HD const Foot<T, D>& foot() const { return best_; }
@@ -290,9 +310,9 @@ class SolidAt {
   // Whether a foot on a face is deeper than the best one.
   MPM_HD bool is_deeper(int face) const { return best_.count > 0 && faces_.e[face].rounded > best_.depth; }
 
-  MPM_HD T height_of(int k, const V& x, V& normal) const {
+  MPM_HD T height_of(bool wanted, int k, const V& x, V& normal) const {
     T beyond;
-    return height_above(poses_, k, -1, x, normal, beyond);
+    return height_above(wanted, poses_, k, -1, x, normal, beyond);
   }
 
   MPM_HD ObstacleShape shape_of(int k) const { return a_.kind[k].shape; }
@@ -300,108 +320,124 @@ class SolidAt {
   // Of a shape of samples, the way between them [m].
   MPM_HD T spacing_of(int k) const { return a_.data[a_.kind[k].first_number + D]; }
 
-  MPM_HD void add_faces(int k) {
-    if (shape_of(k) == ObstacleShape::sampled) return add_by_distance(k);
-    const int count = face_count<D>(a_.kind[k]);
-    if (shape_of(k) == ObstacleShape::box) {  // whose faces are all far where it is
-      V normal;
-      if (!(height_of(k, node_, normal) <= reach_)) return;
-    }
-    for (int f = 0; f < count; f++) {
-      Face<T, D> face{k, count == 1 ? -1 : f, is_flat<D>(shape_of(k)), node_, {}, T(0), T(0)};
-      T beyond;
-      face.height = height_above(poses_, k, face.face, node_, face.normal, beyond);
-      face.depth = T(0) - face.height;
-      if (!(face.height <= seam_ / 2) || !(face.depth <= reach_) || beyond > reach_) continue;
-      if (dot(face.normal, face.normal) > T(0.5)) add(face);
-    }
+  MPM_HD void add_faces(bool wanted, int k) {
+    const bool sampled = wanted && shape_of(k) == ObstacleShape::sampled;
+    if (any_of_warp(sampled)) add_by_distance(sampled, k);
+    int count = wanted && !sampled ? face_count<D>(a_.kind[k]) : 0;
+    const bool is_box = wanted && shape_of(k) == ObstacleShape::box;  // whose faces are all far where it is
+    V unused;
+    if (!(height_of(is_box, k, node_, unused) <= reach_)) count = 0;
+    for (int f = 0; any_of_warp(f < count); f++) add_face(f < count, k, count == 1 ? -1 : f);
+  }
+
+  MPM_HD void add_face(bool wanted, int k, int f) {
+    Face<T, D> face{k, f, wanted && is_flat<D>(shape_of(k)), node_, {}, T(0), T(0)};
+    T beyond = T(0);
+    face.height = height_above(wanted, poses_, k, f, node_, face.normal, beyond);
+    face.depth = T(0) - face.height;
+    if (!wanted || !(face.height <= seam_ / 2) || !(face.depth <= reach_) || beyond > reach_) return;
+    if (dot(face.normal, face.normal) > T(0.5)) add(face);
   }
 
   // Of a shape that is known by its distance alone, its surface, and the planes that free space sees around the point
   // nearest to the node: those of the faces that join there; and where that point is covered, or the node is beside the
   // shape, those of the faces that neighbours of the node see.
-  MPM_HD void add_by_distance(int k) {
+  MPM_HD void add_by_distance(bool wanted, int k) {
     Face<T, D> nearest{k, -1, false, node_, {}, T(0), T(0)};
-    nearest.height = height_of(k, node_, nearest.normal);
+    nearest.height = height_of(wanted, k, node_, nearest.normal);
     nearest.depth = T(0) - nearest.height;
-    bool covered = nearest.height > a_.rounding && nearest.height <= reach_;
-    if (nearest.height <= seam_ / 2 && nearest.depth <= reach_ && dot(nearest.normal, nearest.normal) > T(0.5)) {
-      const T spacing = spacing_of(k), small = T(2.5) * seam_,
-              away = T(1.5) * spacing > small ? T(1.5) * spacing : small;
-      const V first = node_ + nearest.depth * nearest.normal;
-      V unused;
-      const T start = height_of(k, first, unused);
-      // The distance has a ridge where the node is equally deep below several faces. The normal there is between
-      // theirs, and the nearest point is still inside. Samples round a ridge by a quarter of their spacing.
-      const T slack = T(0.5) * seam_ + T(0.25) * spacing;
-      const bool ridge = start < T(0) - slack && has_others(k, nearest.depth);
-      for (int i = 0; i < kLeaning; i++) {
-        V normal;
-        const V at = seen_from(k, first, nearest.normal, away, i);
-        const T height = height_of(k, at, normal);
-        const T cosine = dot(normal, nearest.normal);
-        // The plane that it sees goes through that point or behind it where faces join; it is before a rounded body. At
-        // a ridge it is no deeper than the node.
-        const T lowest = ridge ? nearest.height * (T(1) - cosine) - slack : T(-0.5) * seam_;
-        const bool joins = height + dot(normal, first + T(-1) * at) >= lowest;
-        nearest.flat = nearest.flat || (height >= T(0) && joins && cosine < T(kSame));
-      }
-      if (!nearest.flat || is_a_face(k, first, nearest.normal)) add(nearest);
-      for (int i = 0; nearest.flat && i < kLeaning; i++) add_plane(k, seen_from(k, first, nearest.normal, away, i));
-      covered = covered || (ridge && nearest.flat) || is_covered(k, first, nearest.normal, start);
+    bool covered = wanted && nearest.height > a_.rounding && nearest.height <= reach_;
+    const bool meets = wanted && nearest.height <= seam_ / 2 && nearest.depth <= reach_ &&
+                       dot(nearest.normal, nearest.normal) > T(0.5);
+    if (any_of_warp(meets) && add_around(meets, k, nearest)) covered = true;
+    if (any_of_warp(covered)) add_seen_by_neighbours(covered, k);
+  }
+
+  // Adds the surface that is nearest to the node and the planes around it; whether it is covered.
+  MPM_HD bool add_around(bool wanted, int k, Face<T, D>& nearest) {
+    const T spacing = wanted ? spacing_of(k) : T(0), small = T(2.5) * seam_;
+    const T away = T(1.5) * spacing > small ? T(1.5) * spacing : small;
+    const V first = node_ + nearest.depth * nearest.normal;
+    V unused;
+    const T start = height_of(wanted, k, first, unused);
+    // The distance has a ridge where the node is equally deep below several faces. The normal there is between theirs,
+    // and the nearest point is still inside. Samples round a ridge by a quarter of their spacing.
+    const T slack = T(0.5) * seam_ + T(0.25) * spacing;
+    const bool ridge = has_others(wanted && start < T(0) - slack, k, nearest.depth);
+    for (int i = 0; i < kLeaning; i++) {
+      V normal;
+      const V at = seen_from(wanted, k, first, nearest.normal, away, i);
+      const T height = height_of(wanted, k, at, normal);
+      if (!wanted) continue;
+      const T cosine = dot(normal, nearest.normal);
+      // The plane that it sees goes through that point or behind it where faces join; it is before a rounded body. At a
+      // ridge it is no deeper than the node.
+      const T lowest = ridge ? nearest.height * (T(1) - cosine) - slack : T(-0.5) * seam_;
+      const bool joins = height + dot(normal, first + T(-1) * at) >= lowest;
+      nearest.flat = nearest.flat || (height >= T(0) && joins && cosine < T(kSame));
     }
-    if (covered) add_seen_by_neighbours(k);
+    const bool flat = wanted && nearest.flat, is_face = is_a_face(flat, k, first, nearest.normal);
+    if (wanted && (is_face || !flat)) add(nearest);
+    for (int i = 0; i < kLeaning; i++) add_plane(flat, k, seen_from(flat, k, first, nearest.normal, away, i));
+    const bool is_between = ridge && flat;
+    return is_covered(wanted && !is_between, k, first, nearest.normal, start) || is_between;
   }
 
   // Whether another obstacle, or a wall, is as near to the node as the surface that it is deep below.
-  MPM_HD bool has_others(int k, const T& depth) const {
+  MPM_HD bool has_others(bool wanted, int k, const T& depth) const {
     const T away = 2 * seam_ + depth;
-    V normal;
-    for (uint64_t left = poses_.s.near & ~(uint64_t(1) << k); left; left &= left - 1)
-      if (height_of(lowest_bit(left), node_, normal) <= away) return true;
-    return nearest_wall(a_, node_) <= away;
+    bool found = wanted && nearest_wall(a_, node_) <= away;
+    uint64_t left = wanted && !found ? poses_.s.near & ~(uint64_t(1) << k) : 0;
+    while (any_of_warp(left != 0)) {
+      V unused;
+      const T height = height_of(left != 0, lowest_bit(left), node_, unused);
+      found = found || (left && height <= away);
+      left = found ? 0 : left & (left - 1);
+    }
+    return found;
   }
 
   // Whether a normal at a point of the surface is that of a face: at edges distances rise more slowly along it.
-  MPM_HD bool is_a_face(int k, const V& first, const V& normal) const {
+  MPM_HD bool is_a_face(bool wanted, int k, const V& first, const V& normal) const {
     V there;
-    return height_of(k, first + seam_ * normal, there) > T(0.8) * seam_;
+    return height_of(wanted, k, first + seam_ * normal, there) > T(0.8) * seam_;
   }
 
   // A point around a point of the surface; one behind a face is moved before it.
-  MPM_HD V seen_from(int k, const V& first, const V& axis, const T& away, int i) const {
+  MPM_HD V seen_from(bool wanted, int k, const V& first, const V& axis, const T& away, int i) const {
     const V at = first + away * leaning(axis, i);
     V normal;
-    const T height = height_of(k, at, normal);
-    return height < T(0) ? at + (T(0.3) * away - height) * normal : at;
+    const T height = height_of(wanted, k, at, normal);
+    return wanted && height < T(0) ? at + (T(0.3) * away - height) * normal : at;
   }
 
-  MPM_HD void add_seen_by_neighbours(int k) {
+  MPM_HD void add_seen_by_neighbours(bool wanted, int k) {
     constexpr int count = D == 2 ? 9 : 27;
-    const Matrix<T, D> rotation = poses_[k].rotation;
+    Matrix<T, D> rotation = {};
+    if (wanted) rotation = poses_[k].rotation;
     for (int i = 1; i < count; i++) {
       V way;
       for (int j = 0, rest = i; j < D; j++, rest /= 3) way[j] = T(rest % 3 == 2 ? -1 : rest % 3);
       const V at = node_ + reach_ * (rotation * way);
-      if (sees_a_face(k, at)) add_plane(k, at);
+      add_plane(sees_a_face(wanted, k, at), k, at);
     }
   }
 
   // Whether the nearest point of the surface to a point is on a face: a step against the normal of an outer edge is
   // less deep than it is long. Samples round edges.
-  MPM_HD bool sees_a_face(int k, const V& at) const {
-    const T spacing = spacing_of(k), step = spacing > seam_ ? spacing : seam_;
-    V normal, unused;
-    const T height = height_of(k, at, normal);
-    return height_of(k, at + (T(0) - height - step) * normal, unused) <= T(0) - T(kSame) * step;
+  MPM_HD bool sees_a_face(bool wanted, int k, const V& at) const {
+    const T spacing = wanted ? spacing_of(k) : T(0), step = spacing > seam_ ? spacing : seam_;
+    V normal = zero_vector<T, D>(), unused;
+    const T height = height_of(wanted, k, at, normal);
+    return height_of(wanted, k, at + (T(0) - height - step) * normal, unused) <= T(0) - T(kSame) * step;
   }
 
   // The plane that a point outside the shape sees, unless one with that normal is known.
-  MPM_HD void add_plane(int k, const V& at) {
+  MPM_HD void add_plane(bool wanted, int k, const V& at) {
     Face<T, D> face{k, -1, true, at, {}, T(0), T(0), true};
-    face.height = height_of(k, face.at, face.normal);
+    face.height = height_of(wanted, k, face.at, face.normal);
     face.depth = T(0) - (face.height + dot(face.normal, node_ + T(-1) * face.at));
-    if (!(face.height >= T(0)) || !(dot(face.normal, face.normal) > T(0.5))) return;
+    if (!wanted || !(face.height >= T(0)) || !(dot(face.normal, face.normal) > T(0.5))) return;
     if (!(face.depth >= T(0) - seam_) || face.depth > reach_) return;
     for (int j = 0; j < faces_.count; j++) {
       const Face<T, D>& known = faces_.e[j];
@@ -430,111 +466,149 @@ class SolidAt {
     }
   }
 
-  MPM_HD T height_at(const Face<T, D>& face, const V& x, V& normal) const {
-    normal = face.normal;
-    if (face.flat) return face.height + dot(face.normal, x + T(-1) * face.at);
+  MPM_HD T height_at(bool wanted, const Face<T, D>& face, const V& x, V& normal) const {
+    const bool curved = wanted && !face.flat;
+    V there;
     T beyond;
-    return height_above(poses_, face.obstacle, face.face, x, normal, beyond);
+    const T height = height_above(curved, poses_, face.obstacle, face.face, x, there, beyond);
+    normal = curved ? there : face.normal;
+    return curved ? height : face.height + dot(face.normal, x + T(-1) * face.at);
   }
 
   // The nearest point on all faces of a foot; false where there is none whose faces all stop the node.
-  MPM_HD bool solve(Foot<T, D>& foot) const {
+  MPM_HD bool solve(bool wanted, Foot<T, D>& foot) const {
     bool curved = false;
     for (int i = 0; i < foot.count; i++) curved = curved || !faces_.e[foot.member[i]].flat;
     foot.at = node_;
-    for (int round = 0; round < (curved && foot.count > 1 ? 3 : 1); round++) {
+    const int rounds = curved && foot.count > 1 ? 3 : 1;
+    for (int round = 0; any_of_warp(wanted && round < rounds); round++) {
+      const bool acts = wanted && round < rounds;
       V normal[D];
-      T gram[D][D], again[D][D], share[D], ones[D];
-      for (int i = 0; i < foot.count; i++) {
-        const T height = height_at(faces_.e[foot.member[i]], foot.at, normal[i]);
+      T share[D];
+      MPM_UNROLL for (int i = 0; i < D; i++) {
+        const T height = height_at(acts && i < foot.count, faces_.e[foot.member[i]], foot.at, normal[i]);
         share[i] = dot(normal[i], foot.at + T(-1) * node_) - height;
-        ones[i] = T(1);
       }
-      for (int i = 0; i < foot.count; i++)
-        for (int j = 0; j < foot.count; j++) gram[i][j] = again[i][j] = dot(normal[i], normal[j]);
-      if (!solve_definite<T, D>(gram, share, foot.count) || !solve_definite<T, D>(again, ones, foot.count))
-        return false;
-      foot.at = node_, foot.step = zero_vector<T, D>();
-      for (int i = 0; i < foot.count; i++) {
-        if (share[i] < T(0) - (foot.count > 1 ? seam_ / 2 : a_.rounding)) return false;
-        foot.at = foot.at + share[i] * normal[i];
-        foot.step = foot.step + ones[i] * normal[i];
-      }
+      if (acts) wanted = move_to_faces(normal, share, foot);
     }
-    return length(foot.at + T(-1) * node_) <= reach_;
+    return wanted && length(foot.at + T(-1) * node_) <= reach_;
+  }
+
+  // Of faces by their normals and how far along each the node is from them.
+  MPM_HD bool move_to_faces(const V (&normal)[D], T (&share)[D], Foot<T, D>& foot) const {
+    T gram[D][D], again[D][D], ones[D];
+    for (int i = 0; i < foot.count; i++) {
+      ones[i] = T(1);
+      for (int j = 0; j < foot.count; j++) gram[i][j] = again[i][j] = dot(normal[i], normal[j]);
+    }
+    if (!solve_definite<T, D>(gram, share, foot.count) || !solve_definite<T, D>(again, ones, foot.count)) return false;
+    foot.at = node_, foot.step = zero_vector<T, D>();
+    for (int i = 0; i < foot.count; i++) {
+      if (share[i] < T(0) - (foot.count > 1 ? seam_ / 2 : a_.rounding)) return false;
+      foot.at = foot.at + share[i] * normal[i];
+      foot.step = foot.step + ones[i] * normal[i];
+    }
+    return true;
   }
 
   // Whether the faces are there on the side of the foot where they bound free space, and that is free.
-  MPM_HD bool is_exposed(const Foot<T, D>& foot) const {
-    V normal;
-    for (int i = 0; i < foot.count; i++) {
-      const Face<T, D>& face = faces_.e[foot.member[i]];
+  MPM_HD bool is_exposed(bool wanted, const Foot<T, D>& foot) const {
+    for (int i = 0; any_of_warp(wanted && i < foot.count); i++) {
+      const bool acts = wanted && i < foot.count;
+      const Face<T, D>& face = faces_.e[foot.member[acts ? i : 0]];
       T near = seam_ / 2;
-      if (shape_of(face.obstacle) == ObstacleShape::sampled) {  // whose normal is not defined at an edge
-        normal = face.normal;
-        near = near + T(0.5) * spacing_of(face.obstacle);
-      } else {
-        height_at(face, foot.at, normal);
-      }
+      const bool sampled = acts && shape_of(face.obstacle) == ObstacleShape::sampled;
+      if (sampled) near = near + T(0.5) * spacing_of(face.obstacle);
+      V normal, unused;
+      height_at(acts && !sampled, face, foot.at, normal);  // that of samples is not defined at an edge
       const V beside = foot.at + seam_ * (foot.step + T(-1) * normal);
-      if (!(height_of(face.obstacle, beside, normal) <= near)) return false;
+      const T height = height_of(acts, face.obstacle, beside, unused);
+      wanted = wanted && (!acts || height <= near);
     }
-    return (foot.count == 1 || is_inner(foot)) && is_free(foot.at, foot.step);
+    const bool is_edge = wanted && foot.count > 1, looks_inwards = is_inner(is_edge, foot);
+    return is_free(wanted && (looks_inwards || !is_edge), foot.at, foot.step);
   }
 
   // Whether the edge of a foot looks inwards, so that a point before all of its faces but one is in the body of that:
   // tangents of a rounded body meet outside. Of samples, which round edges; others do not get here.
-  MPM_HD bool is_inner(const Foot<T, D>& foot) const {
+  MPM_HD bool is_inner(bool wanted, const Foot<T, D>& foot) const {
+    bool sampled = false;
+    for (int i = 0; i < foot.count; i++) sampled = sampled || is_of_samples(foot, i);
+    if (!any_of_warp(wanted && sampled)) return wanted;
     V normal[D], unused;
-    for (int i = 0; i < foot.count; i++) height_at(faces_.e[foot.member[i]], foot.at, normal[i]);
-    for (int i = 0; i < foot.count; i++) {
+    MPM_UNROLL for (int i = 0; i < D; i++)
+      height_at(wanted && sampled && i < foot.count, faces_.e[foot.member[i]], foot.at, normal[i]);
+    MPM_UNROLL for (int i = 0; i < D; i++) {
+      const bool acts = wanted && i < foot.count && is_of_samples(foot, i);
       const int k = faces_.e[foot.member[i]].obstacle;
-      if (shape_of(k) != ObstacleShape::sampled) continue;
-      T gram[D][D], share[D];
-      for (int j = 0; j < foot.count; j++) {
-        share[j] = T(i == j);
-        for (int l = 0; l < foot.count; l++) gram[j][l] = dot(normal[j], normal[l]);
-      }
-      if (!solve_definite<T, D>(gram, share, foot.count)) return false;
-      V way = foot.step;  // of height −1 above face i and 1 above the others
-      for (int j = 0; j < foot.count; j++) way = way + T(-2) * share[j] * normal[j];
-      if (height_of(k, foot.at + spacing_of(k) * way, unused) > T(0)) return false;
+      V way = zero_vector<T, D>();
+      if (acts) wanted = way_before(normal, i, foot, way);
+      const T spacing = acts ? spacing_of(k) : T(0);
+      const T height = height_of(acts && wanted, k, foot.at + spacing * way, unused);
+      wanted = wanted && !(acts && height > T(0));
     }
+    return wanted;
+  }
+
+  MPM_HD bool is_of_samples(const Foot<T, D>& foot, int i) const {
+    return shape_of(faces_.e[foot.member[i]].obstacle) == ObstacleShape::sampled;
+  }
+
+  // A way of height −1 above face i of a foot and 1 above the others; false where there is none.
+  MPM_HD bool way_before(const V (&normal)[D], int i, const Foot<T, D>& foot, V& way) const {
+    T gram[D][D], share[D];
+    for (int j = 0; j < foot.count; j++) {
+      share[j] = T(i == j);
+      for (int l = 0; l < foot.count; l++) gram[j][l] = dot(normal[j], normal[l]);
+    }
+    if (!solve_definite<T, D>(gram, share, foot.count)) return false;
+    way = foot.step;
+    for (int j = 0; j < foot.count; j++) way = way + T(-2) * share[j] * normal[j];
     return true;
   }
 
   // Whether a step of the height of a seam from a point that is nearest to the node leads into another obstacle, a
   // wall, or deeper into its own obstacle, at distance `height` from that. Values of an inexact distance rise there,
   // even if that point is not on the surface.
-  MPM_HD bool is_covered(int k, const V& first, const V& normal, const T& height) const {
+  MPM_HD bool is_covered(bool wanted, int k, const V& first, const V& normal, const T& height) const {
     V unused;
-    const T rise = height_of(k, first + seam_ * normal, unused) - height;
-    return !(rise > T(0.25) * seam_) || !is_free(first, normal, uint64_t(1) << k);
+    const T rise = height_of(wanted, k, first + seam_ * normal, unused) - height;
+    const bool free = is_free(wanted && rise > T(0.25) * seam_, first, normal, uint64_t(1) << k);
+    return wanted && !free;
   }
 
   // Whether a step of the height of a seam from a point of surfaces leads into free space, but for some obstacles.
-  MPM_HD bool is_free(const V& at, const V& step, uint64_t but = 0) const {
-    V normal;
-    const V free = at + seam_ * step;
-    for (uint64_t left = poses_.s.near & ~but; left; left &= left - 1)
-      if (!(height_of(lowest_bit(left), free, normal) > seam_ / 2)) return false;
+  MPM_HD bool is_free(bool wanted, const V& at, const V& step, uint64_t but = 0) const {
+    V unused;
+    const V there = at + seam_ * step;
+    bool free = wanted && !faces_a_wall(at, step);
+    uint64_t left = free ? poses_.s.near & ~but : 0;
+    while (any_of_warp(left != 0)) {
+      const T height = height_of(left != 0, lowest_bit(left), there, unused);
+      free = free && (left == 0 || height > seam_ / 2);
+      left = free ? left & (left - 1) : 0;
+    }
+    return free;
+  }
+
+  MPM_HD bool faces_a_wall(const V& at, const V& step) const {
     constexpr double facing = 0.7;  // cosine above which a face looks at a wall
     for (int face = 0; face < 2 * D; face++) {
       if (a_.wall_kind[face] == Contact::open) continue;
       const T towards = face % 2 ? step[face / 2] : T(0) - step[face / 2];
-      if (wall_height(a_, face, at) <= seam_ && towards > T(facing)) return false;
+      if (wall_height(a_, face, at) <= seam_ && towards > T(facing)) return true;
     }
-    return true;
+    return false;
   }
 
   // Keeps a foot where it is exposed and less deep than the best one; of equals, by `comes_first`.
-  MPM_HD bool try_foot(Foot<T, D>& foot) {
-    foot.depth = faces_.e[foot.member[foot.count - 1]].rounded;
-    if (best_.count > 0 && foot.depth > best_.depth) return false;
-    if (!solve(foot) || !is_exposed(foot)) return false;
-    if (best_.count > 0 && !(foot.depth < best_.depth) && !comes_first(foot)) return false;
-    best_ = foot;
-    return true;
+  MPM_HD void try_foot(bool wanted, Foot<T, D>& foot) {
+    if (wanted) foot.depth = faces_.e[foot.member[foot.count - 1]].rounded;
+    wanted = wanted && (best_.count == 0 || foot.depth <= best_.depth);
+    wanted = solve(wanted, foot);
+    wanted = is_exposed(wanted, foot);
+    if (!wanted) return;
+    if (best_.count == 0 || foot.depth < best_.depth || comes_first(foot)) best_ = foot;
   }
 
   // Whether a foot as deep as the best one comes first, whatever the order of obstacles and outlines: by the number of

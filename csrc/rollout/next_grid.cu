@@ -96,13 +96,8 @@ __device__ __noinline__ void add_contact(const NextGridArguments<T, D>& a) {
     bool used = slot < slots.all;
     if (used) there = slot_update(a.update, slot), used = there.active;
     if (used) row = *stored;
-    bool several = row.mass != T(0);
-    if (several) several = lone_touch(a.contact, there.scene, there.corner, local).obstacle == NodeTouch<T, D>::several;
-    if (any_of_warp(several)) {
-      meet_several(several, a.contact, there.scene, there.corner, local, row.value);
-      join_warp();
-    }
-    if (several) watch(a, there, row), *stored = row;
+    if (meet_several(row.mass != T(0), a.contact, there.scene, there.corner, local, row.value))
+      watch(a, there, row), *stored = row;
     if (slot < slots.all) slot = slots.after(slot, used);
   }
 }

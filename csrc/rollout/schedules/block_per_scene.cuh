@@ -66,15 +66,9 @@ __device__ __noinline__ void add_contact(const GridUpdateArguments<T, D>& update
     const int local = i % kBlockNodes<D>;
     SlotUpdate<T, D> there;
     NodeRow<T, D> row{T(0), zero_vector<T, D>()};
-    bool several = i < nodes && rows[i].mass != T(0);
-    if (several) {
-      row = rows[i], there = slot_update(update, i / kBlockNodes<D>);
-      several = lone_touch(contact, there.scene, there.corner, local).obstacle == NodeTouch<T, D>::several;
-    }
-    if (!any_of_warp(several)) continue;
-    meet_several(several, contact, there.scene, there.corner, local, row.value);
-    join_warp();
-    if (several) rows[i] = row;
+    const bool has_mass = i < nodes && rows[i].mass != T(0);
+    if (has_mass) row = rows[i], there = slot_update(update, i / kBlockNodes<D>);
+    if (meet_several(has_mass, contact, there.scene, there.corner, local, row.value)) rows[i] = row;
   }
 }
 

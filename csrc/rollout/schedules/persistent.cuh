@@ -132,15 +132,12 @@ struct NodeVelocities {
     if (node.mass == T(0)) return zero_vector<T, D>();
     const Vector<T, D> v = update_node(update, there, place.local, node).value;
     if constexpr (C == Contacts::none) return v;
-    const NodeTouch<T, D> touch = touch_of(there, place);
+    const NodeTouch<T, D> touch = lone_touch(contact, there.scene, there.corner, place.local);
     several = several || touch.obstacle == touch.several;
     return touch.obstacle >= 0 ? touch.after(v) : v;
   }
   __device__ NodeRow<T, D> row(const TileNode& place) const {
     return nodes.at(int64_t(place.slot) * kBlockNodes<D> + place.local);
-  }
-  __device__ NodeTouch<T, D> touch_of(const SlotUpdate<T, D>& there, const TileNode& place) const {
-    return lone_touch(contact, there.scene, there.corner, place.local);
   }
 };
 
@@ -149,23 +146,19 @@ template <class S, class T, int D>
 __device__ __noinline__ void add_contact(const TileNodes<S>& nodes,
                                          const NodeVelocities<Contacts::several_surfaces, T, D>& velocities,
                                          NodeValue<T, D>* tile) {
-  const auto& contact = velocities.contact;
   for (int i = threadIdx.x; any_of_warp(i < nodes.count()); i += S::threads) {
     TileNode node{-1};
     if (i < nodes.count()) node = nodes.at(i);
     SlotUpdate<T, D> there;
     Vector<T, D> v = zero_vector<T, D>();
-    bool several = node.slot >= 0 && velocities.row(node).mass != T(0);
-    if (several) {
+    const bool has_mass = node.slot >= 0 && velocities.row(node).mass != T(0);
+    if (has_mass) {
       there = nodes.update_of(node, velocities.update);
 #pragma unroll
       for (int axis = 0; axis < D; axis++) v[axis] = tile[node.place].e[axis];
-      several = velocities.touch_of(there, node).obstacle == NodeTouch<T, D>::several;
     }
-    if (!any_of_warp(several)) continue;
-    meet_several(several, contact, there.scene, there.corner, node.local, v);
-    join_warp();
-    if (several) store(v, tile[node.place]);
+    if (meet_several(has_mass, velocities.contact, there.scene, there.corner, node.local, v))
+      store(v, tile[node.place]);
   }
 }
 
