@@ -98,12 +98,14 @@ MPM_HD T advance_volume_ratio(const T& J, const Matrix<T, D>& C, const T& dt) {
   return J + dt * trace(C) * J;
 }
 
-// Time step of a particle. An invalid scene id gets that of scene 0: such a particle is not transferred anyway.
+// Time step of a particle. An absent particle, of a negative scene, has that of scene 0. A particle of a scene without
+// one has NaN, as `load_parameter` of laws.
 template <class T, int D>
 MPM_HD T particle_dt(const AdvanceArguments<T, D>& a, const One<T>& at) {
   if (!a.scene_dt.pointer) return T(a.dt);
   const int64_t s = a.scene ? a.scene[at.p * a.scene_stride] : 0;
-  return T(a.dt) * a.scene_dt.pointer[(s >= 0 && s < a.scenes ? s : 0) * a.scene_dt.stride[0]];
+  if (s >= a.scenes) return T(NAN);
+  return T(a.dt) * a.scene_dt.pointer[(s > 0 ? s : 0) * a.scene_dt.stride[0]];
 }
 
 template <class T, int D>

@@ -106,6 +106,21 @@ def test_advance_gradients(device, dim):
     torch.autograd.gradgradcheck(function, leaves)
 
 
+def test_particles_of_scenes_without_dt_have_no_position(device, dim):
+    """As many scenes as dt has entries: a particle of a later one has NaN, an absent one the dt of scene 0."""
+    p = random_particles(dim, device=device, sizes=(6,))
+    scene = torch.tensor([0, 1, 2, 3, -1, 1], dtype=torch.int32, device=device)
+    dt = torch.tensor([0.1, 0.2], dtype=torch.float64, device=device)
+    x, F, J = mpm.advance(p.x, p.v, dt, p.C, p.stress, p.volume, scene, 2)
+    known = [0, 1, 4, 5]
+    expected = reference.advance(p.x[known], p.v[known], dt[[0, 1, 0, 1]], p.C[known], p.stress[known], p.volume[known])
+    for got, right in zip((x, F, J), expected, strict=True):
+        torch.testing.assert_close(got[known], right)
+        assert got[2:4].isnan().all()
+    raw = torch.ops.torch_mpm.advance(p.x, p.v, None, None, None, scene, dt, 1.0)[0]
+    assert raw[2:4].isnan().all() and not raw[known].isnan().any()
+
+
 def test_particles_outside_stay(device, dim, kernel):
     p = random_particles(dim, kernel, device=device, sizes=(40,))
     x = p.x.clone()

@@ -31,7 +31,8 @@ def advance(
         C: velocity gradient [P, D, D] [1/s]; needed with F or J.
         F: deformation gradient [P, D, D], or None.
         J: volume ratio [P], or None.
-        scene: scene of each particle, int32 [P]; needed for a dt that differs between scenes.
+        scene: scene of each particle, int32 [P]; needed for a dt that differs between scenes. With a dt per scene, a
+            particle of a scene that is not below B has the dt NaN.
         scenes: number of scenes B.
 
     Returns:
