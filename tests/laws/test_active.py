@@ -104,3 +104,13 @@ def test_wrong_muscles(device):
         law.stress(state.replace(extra={"activation": torch.ones(len(state), 1, dtype=F64, device=device)}))
     with pytest.raises(ValueError, match=r"direction must have shape \[2\] or"):
         mpm.Active(passive(), torch.ones(3, device=device)).stress(state)
+
+
+def test_a_direction_given_once(device):
+    """[1, D] is [D], for any number of particles."""
+    step, state = make_step(2), stretched(2, device)
+    ends = []
+    for direction in (torch.tensor([0.6, 0.8], dtype=F64), torch.tensor([[0.6, 0.8]], dtype=F64)):
+        step.law = mpm.Active(passive(), direction.to(device))
+        ends.append((step.law.stress(state), mpm.rollout(step, state, 3, 1e-4).v))
+    assert all(torch.equal(a, b) for a, b in zip(*ends, strict=True))

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from ..cuda_graphs.capture import Remembered, as_remembered, is_captured, is_same, is_traced
-from ..geometry.per_scene import filled, finite
+from ..geometry.values import filled
 from ..geometry.vectors import composed, norm
 from .motion import PACE, RigidMotion
 
@@ -427,7 +427,10 @@ def _placed(obstacle: Obstacle) -> Course:
 def _left_at(obstacle: Obstacle) -> Left:
     """An obstacle at the pose of its attributes."""
     values = _assigned(obstacle)
-    copies = tuple(_copy(name, value) for name, value in zip(ASSIGNED, values, strict=True))
+    copies = [
+        value.clone() if isinstance(value, Tensor) else obstacle.value_of(name)
+        for name, value in zip(ASSIGNED, values, strict=True)
+    ]
     given = tuple(as_remembered(value) for value in values)
     return Left(given, obstacle.placements, (*copies, obstacle.start, obstacle.end))
 
@@ -472,13 +475,6 @@ def _sameness(obstacle: Obstacle, left: Left) -> list[bool]:
 
 def _is_as_left(obstacle: Obstacle, left: Left) -> bool:
     return left.placements == obstacle.placements and is_same(left.given, _assigned(obstacle))
-
-
-def _copy(name: str, value: Any) -> Any:
-    """Copy of a value, independent of later writes to tensors and lists; differentiable."""
-    if isinstance(value, Tensor):
-        return value.clone()
-    return value if value is None or isinstance(value, (tuple, float)) or callable(value) else finite(name, value)
 
 
 class _Part(NamedTuple):

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from ..errors import shape_of
-from ..geometry.per_scene import SceneParameters, Value, finite, floats, per_node
+from ..geometry.per_scene import SceneParameters, per_node
+from ..geometry.values import Value, as_value, finite, shape_of_value
 from ..geometry.vectors import norm, transform
 from .waypoints import Waypoints
 
-Path = Callable[[Tensor], "Tensor | Sequence[Any] | np.ndarray"]
-"""A position as a function of time, [] or [B] to [D] or [B, D]: a tensor, an array, or D numbers or tensors."""
+Path = Callable[[Tensor], Value]
+"""A position as a function of time, [] or [B] to [D] or [B, D], in the forms of `geometry.values.Value`."""
 PACE = 1e-4
 """Time over which a path without a derivative is differenced, unless a step sets it [s]."""
 
@@ -31,21 +31,37 @@ class Pose(NamedTuple):
     rotation: Tensor  # [D, D] or [B, D, D]
 
 
+def _checked_position(name: str, value: Any) -> Any:
+    if value is None:
+        raise TypeError(f"{name} must be numbers, a tensor or a function of time, got None")
+    return value if callable(value) else finite(name, value)
+
+
 class RigidMotion(SceneParameters):
     """A body that moves and turns at constant rates from time `start` on, or along a path.
 
     During a call of a step another motion, `control`, may replace it; see `boundaries.control`.
 
     Args:
-        position: of its centre at time `start` [m]: D numbers, a tensor [D] or [B, D], or a function of the time, a
-            tensor [] or [B], that returns one of these, see `Path`.
-        velocity: of its centre [m/s]: D numbers, or a tensor [D] or [B, D]; None where position is a function.
+        position: of its centre at time `start` [m]: [D] or [B, D] in any form of `geometry.values.Value`, or a function
+            of the time, a tensor [] or [B], that returns one of these.
+        velocity: of its centre [m/s], [D] or [B, D]; None where position is a function.
         rotation: orientation at time `start` [rad]: an angle (2-D) or a rotation vector (3-D), about the centre.
         angular_velocity: [rad/s], in the same forms.
         start: [s]
+
+    Raises:
+        TypeError, ValueError: for a value of another form or that is not finite, also where it is assigned; values of
+            tensors on other devices than the CPU are not read.
     """
 
     RANKS: ClassVar = {"position": 1, "velocity": 1, "rotation": None, "angular_velocity": None}
+    CHECKS: ClassVar = {
+        "position": _checked_position,
+        "velocity": finite,
+        "rotation": finite,
+        "angular_velocity": finite,
+    }
 
     def __init__(
         self,
@@ -55,14 +71,10 @@ class RigidMotion(SceneParameters):
         angular_velocity: Value | None,
         start: float,
     ) -> None:
-        if position is None:
-            raise TypeError("position must be numbers, a tensor or a function of time, got None")
         if callable(position) and velocity is not None:
             raise ValueError("velocity must be None where position is a function of time: it is its derivative")
-        self.position = position if callable(position) else finite("position", position)
-        self.velocity = finite("velocity", velocity)
-        self.rotation = finite("rotation", rotation)
-        self.angular_velocity = finite("angular_velocity", angular_velocity)
+        self.position, self.velocity = position, velocity
+        self.rotation, self.angular_velocity = rotation, angular_velocity
         self.start = float(start)
         self.end = math.inf
         self.pace: float | Tensor = PACE
@@ -99,7 +111,7 @@ class RigidMotion(SceneParameters):
         motion = self.motion
         if self.follows_path:
             return motion.at(_as_time(time, like)).to(like.dtype)
-        position = motion.parameter("position", like, (_length(motion.position),))
+        position = motion.parameter("position", like, shape_of_value(motion.value_of("position"))[-1:] or (1,))
         if motion.velocity is None:
             return position
         velocity = motion.parameter("velocity", like, position.shape[-1:])
@@ -225,13 +237,13 @@ class RigidMotion(SceneParameters):
 
 
 def _as_position(value: Any, time: Tensor) -> Tensor:
-    """Numbers, or a mixture of numbers and tensors [] or [B], as a position [D] or [B, D]."""
-    if isinstance(value, (list, tuple)) and any(isinstance(part, Tensor) for part in value):
-        parts = [part if isinstance(part, Tensor) else torch.full_like(time, float(part)) for part in value]
-        return torch.stack(torch.broadcast_tensors(*parts), -1)
-    if isinstance(value, (list, tuple, np.ndarray)):
-        return torch.as_tensor(np.asarray(value, dtype=np.float64), device=time.device)
-    raise TypeError(f"position must return a tensor, an array or numbers at a time, got {shape_of(value)}")
+    """Position [D] or [B, D] that a function of time returns in another form than a tensor."""
+    if value is None or isinstance(value, str):
+        raise TypeError(f"position must return a tensor, an array or numbers at a time, got {shape_of(value)}")
+    position = as_value("the result of position", value, time)
+    if isinstance(position, Tensor):
+        return position
+    return torch.tensor(position, dtype=torch.float64, device="cpu").to(time.device, non_blocking=True)
 
 
 def to_body(rotation: Tensor | None, arm: Tensor) -> Tensor:
@@ -268,7 +280,3 @@ def _as_time(time: float | Tensor, like: Tensor) -> Tensor:
 def _column(time: float | Tensor, rank: int) -> float | Tensor:
     """Times [] or [B] as factors of values [...] or [B, ...] of `rank` dimensions."""
     return time.reshape(time.shape + (1,) * rank) if isinstance(time, Tensor) and time.dim() else time
-
-
-def _length(value: Any) -> int:
-    return int(value.shape[-1]) if isinstance(value, Tensor) and value.dim() else len(floats("position", value))

@@ -13,9 +13,10 @@ from torch import Tensor
 
 from ..cuda_graphs.capture import DeviceConstantCache
 from ..errors import check_count, check_number, shape_of
-from ..geometry import shapes
-from ..geometry.per_scene import Value, finite, per_node
+from ..geometry import shapes, values
+from ..geometry.per_scene import per_node
 from ..geometry.shapes import Shape
+from ..geometry.values import Value
 from ..geometry.vectors import transform
 from ..laws.parameters import tensors_in
 from .motion import Path, Pose, RigidMotion, to_body
@@ -60,17 +61,21 @@ class Obstacle(RigidMotion):
 
     Args:
         shape: see `torch_mpm.shapes`.
-        position: centre (or a point of the plane) at time `start` [m]: D numbers, a tensor [D] or [B, D], or a function
-            of the time, a tensor [] or [B], that returns one of these, an array, or D numbers or tensors [] or [B].
+        position: centre (or a point of the plane) at time `start` [m], [D] or [B, D] in one of the forms below; or a
+            function of the time, a tensor [] or [B], that returns one of them.
         kind: "sticky", "slip" or "separate".
-        friction: Coulomb coefficient ≥ 0: a number, or a tensor [] or [B].
-        velocity: velocity of the centre [m/s]: D numbers, or a tensor [D] or [B, D]. Not with a function as position,
-            whose derivative by time is the velocity; where the derivative is zero, as of functions of numbers, its
-            difference over a step.
+        friction: Coulomb coefficient ≥ 0, [] or [B].
+        velocity: velocity of the centre [m/s], [D] or [B, D]. Not with a function as position, whose derivative by time
+            is the velocity; where the derivative is zero, as of functions of numbers, its difference over a step.
         rotation: orientation at time `start` [rad]: an angle (2-D) or a rotation vector (3-D), about the centre.
         angular_velocity: constant [rad/s], in the same forms.
         start, end: the obstacle acts while start ≤ time < end [s].
         scene: it acts only in this scene of a batch; None for all.
+
+    Parameters of shapes and obstacles have these forms, in a constructor, in an assignment, and as the result of a
+    function: a number; a tensor or an array [], [B], [D] or [B, D]; a list or tuple of D components, which are numbers,
+    or tensors and arrays [] or [B], and are stacked on the last axis; a list of B lists of D numbers, [B, D]. So two
+    arrays in a list are two components, and two lists in a list are two scenes.
 
     All of these may be assigned between control steps: one is a call of a step, of `rollout`, `rollout_to` or
     `Environments.advance`, or the steps from one call of a hook to the next. A state stores where its steps have left
@@ -96,10 +101,12 @@ class Obstacle(RigidMotion):
     whose shapes the kernel knows act in it, see `torch_mpm.ops.contact`; the others by the torch operations here.
 
     Raises:
-        TypeError, ValueError: for a wrong argument; shapes of tensors are checked at the first use.
+        TypeError, ValueError: for a wrong argument, also where it is assigned; shapes are checked at the first use, and
+            values of tensors on other devices than the CPU are not read.
     """
 
     RANKS: ClassVar = {**RigidMotion.RANKS, "friction": 0}
+    CHECKS: ClassVar = {**RigidMotion.CHECKS, "friction": values.friction}
     placed: Course | None = None
     """Course of the latest control step that began at the attributes, if these were numbers."""
 
@@ -120,8 +127,6 @@ class Obstacle(RigidMotion):
             raise TypeError(f"shape must be a shape of torch_mpm.shapes, got {shape_of(shape)}")
         if kind not in CONTACTS:
             raise ValueError(f"kind must be one of {sorted(CONTACTS)}, got {kind!r}")
-        if not isinstance(friction, Tensor):
-            friction = float(check_number("friction", friction, "a finite number >= 0", lambda v: 0 <= v < math.inf))
         for name, value in (("start", start), ("end", end)):
             check_number(name, value, "a number", lambda v: v == v)
         if not (math.isfinite(start) and start <= end):
@@ -169,9 +174,9 @@ class Obstacle(RigidMotion):
             TypeError, ValueError: for numbers that are not finite.
         """
         if position is not None:
-            self.position = position if callable(position) else finite("position", position)
+            self.position = position
         if rotation is not None:
-            self.rotation = finite("rotation", rotation)
+            self.rotation = rotation
         self.placements += 1
 
     def pose_in(self, state: State) -> Pose:

@@ -91,9 +91,9 @@ class SolidNodes:
     def frictions(self, x: Tensor) -> Tensor:
         """Of the obstacles at nodes x [N, D], [N, K], without gradient."""
         columns = [
-            o.at_nodes("friction", x, (), self.scene).detach().expand(len(x))
-            if isinstance(o.friction, Tensor)
-            else x.new_full((len(x),), o.friction)
+            x.new_full((len(x),), o.friction)
+            if isinstance(o.friction, float)
+            else o.at_nodes("friction", x, (), self.scene).detach().expand(len(x))
             for o in self.obstacles
         ]
         return torch.stack(columns, 1)
@@ -222,7 +222,7 @@ class Meeting:
             if moves is not None:
                 velocity = torch.where(mine, moves, velocity)
             value = obstacle.friction
-            if isinstance(value, Tensor):
+            if not isinstance(value, float):
                 value = obstacle.at_nodes("friction", at, (), solid.scene)
             friction = torch.where(own, value, friction)
             kind = torch.where(own, KINDS[obstacle.kind], kind)

@@ -143,6 +143,11 @@ def _is_plain(t: Tensor) -> bool:
     return plain and not torch._C._functorch.is_functorch_wrapped_tensor(t)
 
 
+def is_readable(t: Tensor) -> bool:
+    """Whether the values of a tensor can be read without waiting for a device or ending a compiled function."""
+    return not torch.compiler.is_compiling() and t.is_cpu and _is_plain(t)
+
+
 def _address(t: Tensor) -> int:
     return t.data_ptr() if _is_plain(t) else 0
 

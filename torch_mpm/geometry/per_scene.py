@@ -2,32 +2,53 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Callable
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from ..cuda_graphs.capture import DeviceConstantCache
-from ..errors import check_number, shape_of
+from ..errors import shape_of
 from ..laws.parameters import TensorModule
+from .values import as_value, filled, shape_of_value
 
-Value = float | Sequence[float] | Tensor
+WRITABLE = (list, np.ndarray)
+"""Types of numbers that may be written to."""
 
 
 class SceneParameters(TensorModule):
-    """Module whose parameters are numbers or tensors, one for all scenes or one per scene."""
+    """Module whose parameters are numbers or tensors, one for all scenes or one per scene.
+
+    A parameter is checked when it is assigned, in the constructor and later. Lists and arrays of numbers are stored as
+    they are, so that a later write to them acts like an assignment; `value_of` reads them.
+    """
 
     _constants: dict[tuple[str, torch.device, torch.dtype], DeviceConstantCache]
 
     RANKS: ClassVar[dict[str, int | None]] = {}
     """Number of dimensions of a value of each parameter that may be given per scene; None for that of an angle."""
+    CHECKS: ClassVar[dict[str, Callable[[str, Any], Any]]] = {}
+    """Functions of name and value that return the stored form of a parameter, or raise (see `geometry.values`)."""
 
     def __new__(cls, *arguments: Any, **named: Any) -> Any:
         module = super().__new__(cls, *arguments, **named)
         module._constants = {}
         return module
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        check = self.CHECKS.get(name)
+        if check is not None:
+            checked = check(name, value)
+            writable = isinstance(value, WRITABLE) and not isinstance(checked, Tensor)
+            value = value if writable else checked
+        super().__setattr__(name, value)
+
+    def value_of(self, name: str) -> Any:
+        """A parameter as a number, a tuple of numbers or of such tuples, a tensor, a function, or None."""
+        value = getattr(self, name, None)
+        return self.CHECKS.get(name, as_value)(name, value) if isinstance(value, WRITABLE) else value
 
     def parameter(self, name: str, like: Tensor, shape: tuple[int, ...]) -> Tensor:
         """A parameter as a tensor of `shape` or [B, *shape], with the dtype and device of `like`.
@@ -55,13 +76,12 @@ class SceneParameters(TensorModule):
             ValueError: for another number of values than one or B.
         """
         for name, given in self.RANKS.items():
-            value, rank = getattr(self, name, None), (0 if dim == 2 else 1) if given is None else given
-            if isinstance(value, Tensor) and value.dim() == rank + 1 and value.shape[0] not in (1, scenes):
-                batch = ["B", *value.shape[1:]]
+            value, rank = self.value_of(name), (0 if dim == 2 else 1) if given is None else given
+            shape = () if value is None or callable(value) else shape_of_value(value)
+            if len(shape) == rank + 1 and shape[0] not in (1, scenes):
+                batch = str(["B", *shape[1:]]).replace("'", "")
                 raise ValueError(
-                    f"{name} must be given once or per scene, {batch} with B = {scenes}, got {shape_of(value)}".replace(
-                        "'", ""
-                    )
+                    f"{name} must be given once or per scene, {batch} with B = {scenes}, got {list(shape)}"
                 )
 
     def at_nodes(self, name: str, like: Tensor, shape: tuple[int, ...], scene: Tensor | None) -> Tensor:
@@ -70,32 +90,19 @@ class SceneParameters(TensorModule):
 
     def of_scene(self, name: str, rank: int, scene: int) -> Tensor:
         """A parameter of `rank` dimensions of one scene, float64 on the CPU."""
-        value = getattr(self, name)
+        value = self.value_of(name)
         if not isinstance(value, Tensor):
-            return torch.tensor(value, dtype=torch.float64, device="cpu")
+            value = torch.tensor(value, dtype=torch.float64, device="cpu")
         value = value.detach().to("cpu", torch.float64)
         return value if value.dim() == rank else value[scene if len(value) > 1 else 0]
 
     def _constant(self, name: str, value: Any, like: Tensor) -> Tensor:
         """Numbers as a tensor; copied to a device once, so that later steps neither wait nor prevent capture."""
-        if isinstance(value, (list, tuple)) and any(isinstance(part, Tensor) for part in value):
-            raise TypeError(f"{name} must be numbers or one tensor, got tensors in a list: stack them (torch.stack)")
         if torch.compiler.is_compiling() or type(like) not in (Tensor, torch.nn.Parameter):
-            return filled(value, like)
+            return filled(self.value_of(name), like)
         kept = self._constants.setdefault((name, like.device, like.dtype), DeviceConstantCache())
-        result: Tensor = kept.get((value,), lambda: filled(value, like), like)
+        result: Tensor = kept.get((value,), lambda: filled(self.value_of(name), like), like)
         return result
-
-
-def filled(value: Any, like: Tensor) -> Tensor:
-    """Numbers as a tensor with the dtype and device of `like`. Few numbers are filled in on the device, which does not
-    wait for it as a copy from the host does.
-    """
-    numbers = value if isinstance(value, (tuple, list)) else (value,)
-    if like.is_cpu or not 0 < len(numbers) <= 3 or not all(isinstance(a, (int, float)) for a in numbers):
-        return torch.tensor(value, dtype=like.dtype, device=like.device)
-    entries = [torch.full((), a, dtype=like.dtype, device=like.device) for a in numbers]
-    return entries[0] if numbers is not value else torch.stack(entries)
 
 
 def per_node(value: Tensor, rank: int, scene: Tensor | None) -> Tensor:
@@ -107,49 +114,3 @@ def per_node(value: Tensor, rank: int, scene: Tensor | None) -> Tensor:
     if scene is None or value.shape[0] == 1:
         return value[0]
     return value.index_select(0, scene.clamp(0, value.shape[0] - 1))
-
-
-# ---- checks of arguments; tensors are stored unchanged, and their values are not read
-
-
-def floats(name: str, value: Any) -> tuple[float, ...]:
-    """A number or a sequence of them."""
-    if isinstance(value, (Mapping, Set)):
-        raise TypeError(f"{name} must be numbers in an order, got {type(value).__name__}")
-    values = value if hasattr(value, "__len__") and not isinstance(value, (str, type)) else (value,)
-    return tuple(float(check_number(name, a, "a number", lambda v: True)) for a in values)
-
-
-def finite(name: str, value: Any) -> Any:
-    """Numbers, checked and made immutable; None unchanged."""
-    if value is None or isinstance(value, Tensor):
-        return value
-    numbers = floats(name, value)
-    if not all(math.isfinite(a) for a in numbers):
-        raise ValueError(f"{name} must be finite, got {value}")
-    return numbers if hasattr(value, "__len__") else numbers[0]
-
-
-def constant(name: str, value: Any) -> Any:
-    """Whether a value is neither None nor a function."""
-    if value is None or callable(value):
-        raise TypeError(f"{name} must be numbers or a tensor, got {shape_of(value)}")
-    return finite(name, value)
-
-
-def direction(name: str, value: Any) -> Any:
-    """Numbers that are not all zero."""
-    if not isinstance(constant(name, value), Tensor) and not any(floats(name, value)):
-        raise ValueError(f"{name} must not be zero, got {value}")
-    return finite(name, value)
-
-
-def extent(name: str, value: Any) -> Any:
-    """Lengths, non-negative and without gradient."""
-    value = constant(name, value)
-    if isinstance(value, Tensor):
-        if value.requires_grad:
-            raise ValueError(f"{name} must not require grad: which nodes are inside is not differentiable")
-    elif min(floats(name, value), default=-1) < 0:
-        raise ValueError(f"{name} must be >= 0, got {value}")
-    return value

@@ -164,7 +164,7 @@ def node_bounds(
 def rubs(obstacle: Any) -> bool:
     """Whether an obstacle has friction."""
     friction = getattr(obstacle, "friction", 0.0)
-    return isinstance(friction, Tensor) or friction != 0
+    return not (isinstance(friction, float) and friction == 0)
 
 
 def _add_walls(bounds: NodeBounds, blocks: Blocks, faces: Sequence[Face], positions: Tensor, first: int) -> None:

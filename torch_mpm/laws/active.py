@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ..errors import check_vector, shape_of
+from ..geometry.values import finite
 from ..ops.law import law_energy, law_stiffness, law_update, law_wave_modulus
 from ..step.particle_operations import of_particles
 from .custom import as_law
@@ -37,7 +38,7 @@ class Active(Material):
     Args:
         law: any law of F, also a function or module F -> Kirchhoff stress.
         direction: direction of the fibres at rest, unit vectors d, or zero where there are none: D numbers, or a tensor
-            [D] or [P, D], in the order of `state.ids` where particles were reordered; it may require grad.
+            [D], [1, D] or [P, D], in the order of `state.ids` where particles were reordered; it may require grad.
 
     Raises:
         TypeError, ValueError: for a law without F, or a direction of another shape.
@@ -53,6 +54,7 @@ class Active(Material):
         self._everywhere = not isinstance(direction, Tensor)  # Numbers are valid on any device.
         if not isinstance(direction, Tensor):
             direction = torch.tensor(check_vector("direction", direction), dtype=torch.float64, device="cpu")
+        finite("direction", direction)
         if direction.dim() not in (1, 2) or direction.shape[-1] not in (2, 3) or not direction.is_floating_point():
             raise ValueError(f"direction must be a floating tensor of shape [D] or [P, D], got {shape_of(direction)}")
         self.state_fields, self.extra_fields = law.state_fields, (*law.extra_fields, ACTIVE_STRESS)
@@ -75,7 +77,7 @@ class Active(Material):
 
     def check_parameters(self, particles: int, scenes: int | None) -> None:
         self.law.check_parameters(particles, scenes)
-        if self.direction.dim() != 1 and (self.direction.dim() != 2 or len(self.direction) != particles):
+        if self.direction.dim() != 1 and (self.direction.dim() != 2 or len(self.direction) not in (1, particles)):
             found = shape_of(self.direction)
             raise ValueError(f"direction must have shape [D] or [P, D] with P = {particles}, got {found}")
 
@@ -102,7 +104,8 @@ class Active(Material):
         if self._everywhere and self.direction.device != state.x.device:
             self.direction = self.direction.to(state.x.device)
         active_stress, x = self._active_stress(state), state.x
-        direction = of_particles("direction", self.direction, state, tuple(x.shape)).to(x.dtype)
+        direction = self.direction[0] if self.direction.shape[:-1] == (1,) else self.direction
+        direction = of_particles("direction", direction, state, tuple(x.shape)).to(x.dtype)
         entries = list(direction.unbind(-1))
         return [active_stress, *entries, *(x.new_zeros(()) for _ in range(3 - len(entries)))]
 

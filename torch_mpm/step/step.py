@@ -16,7 +16,8 @@ from ..boundaries.control import control_step, motions_now
 from ..boundaries.impulses import Impulses, check_impulse, impulses_of, no_impulse
 from ..boundaries.thickness import warn_of_thin_walls
 from ..cuda_graphs.capture import DeviceConstantCache, is_captured, is_traced, is_transformed
-from ..errors import REAL, PrecisionWarning, check_flag, check_number, check_vector, is_finite, shape_of
+from ..errors import REAL, PrecisionWarning, check_flag, check_number, is_finite, shape_of
+from ..geometry.values import Value, constant, filled, shape_of_value
 from ..grid import resolution
 from ..grid.grid import Blocks, Grid, check_grid
 from ..heat.heat import Heat
@@ -61,8 +62,8 @@ class Step(TensorModule):
     Args:
         grid: the lattice.
         law: a material; or a function or module F [P, D, D] -> Kirchhoff stress, which becomes a `CustomLaw`.
-        gravity: [m/s²]; D numbers, or a tensor [D] or [B, D] that may require grad, on the device of the particles, a
-            buffer or parameter of the step; None for none.
+        gravity: [m/s²]: D numbers, B lists of D numbers, an array, or a tensor [D] or [B, D] that may require grad, on
+            the device of the particles, a buffer or parameter of the step; None for none.
         walls: "slip", "sticky", "separate" or "mirror" on every face of the domain, a `Walls`, or None.
         boundaries: obstacles with the interface of `torch_mpm.boundaries`, applied in order; a list that may change.
         transfer: "apic" (Jiang et al. 2015), "pic", or "flip". All keep momentum; only "apic" keeps angular momentum
@@ -98,7 +99,7 @@ class Step(TensorModule):
 
     grid: Grid
     law: Material
-    gravity: tuple[float, ...] | Tensor | None
+    gravity: Any  # Numbers, a tensor or None.
     walls: Walls | None
     boundaries: BoundaryList
     on_grid: Callable[[Blocks, Tensor, Tensor, float | Tensor], Tensor] | None
@@ -113,7 +114,7 @@ class Step(TensorModule):
         self,
         grid: Grid,
         law: Material | Callable[[Tensor], Any],
-        gravity: Sequence[float] | Tensor | None = None,
+        gravity: Value | None = None,
         walls: str | Walls | None = None,
         boundaries: Sequence[Boundary] = (),
         transfer: str = "apic",
@@ -128,7 +129,7 @@ class Step(TensorModule):
         super().__init__()
         self.grid = grid
         self.law = law  # type: ignore[assignment]
-        self.gravity = gravity  # type: ignore[assignment]
+        self.gravity = gravity
         self.walls = walls  # type: ignore[assignment]
         self.boundaries = boundaries  # type: ignore[assignment]
         self.transfer = transfer
@@ -381,10 +382,11 @@ class Step(TensorModule):
         if gravity is None:
             return None
         if isinstance(gravity, Tensor):
-            return gravity.to(x.dtype)
+            gravity = gravity.to(x.dtype)
+            return gravity.squeeze(0) if len(gravity) == 1 and gravity.dim() == 2 else gravity
 
         def make() -> Tensor:
-            return torch.tensor(gravity, dtype=x.dtype, device=x.device).expand(self.grid.scenes, -1).contiguous()
+            return filled(gravity, x).expand(self.grid.scenes, -1).contiguous()
 
         return self._kept_gravity.get((gravity, self.grid.scenes, x.dtype, x.device), make, x)
 
@@ -639,12 +641,12 @@ def _argument(step: Step, name: str, value: Any) -> Any:
     return value
 
 
-def _checked_gravity(gravity: Any, grid: Grid) -> tuple[float, ...] | Tensor:
-    if not isinstance(gravity, Tensor):
-        return check_vector("gravity", gravity, grid.dim)
-    if not gravity.is_floating_point():
+def _checked_gravity(given: Any, grid: Grid) -> Any:
+    gravity = constant("gravity", given)
+    if isinstance(gravity, Tensor) and not gravity.is_floating_point():
         raise TypeError(f"gravity must be numbers or a floating tensor, got {gravity.dtype}")
-    if tuple(gravity.shape) not in ((grid.dim,), (grid.scenes, grid.dim)):
-        expected = f"[D] or [B, D] = [{grid.scenes}, {grid.dim}]"
-        raise ValueError(f"gravity must have shape {expected}, got {shape_of(gravity)}")
+    shape = shape_of_value(gravity)
+    if shape not in ((grid.dim,), (1, grid.dim), (grid.scenes, grid.dim)):
+        found = list(shape) if isinstance(given, Tensor) else given
+        raise ValueError(f"gravity must have shape [D] or [B, D] = [{grid.scenes}, {grid.dim}], got {found}")
     return gravity

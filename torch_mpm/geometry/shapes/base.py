@@ -171,10 +171,3 @@ def ball_volume(dim: int, radius: float) -> float:
 
 def around_origin(upper: Tensor) -> tuple[Tensor, Tensor]:
     return -upper, upper
-
-
-def numbers_of(value: Any) -> list[float]:
-    """All numbers of a value; none of tensors on another device than the CPU."""
-    if isinstance(value, Tensor):
-        return [] if value.device.type != "cpu" else value.detach().double().reshape(-1).tolist()
-    return [number for item in value for number in (numbers_of(item) if hasattr(item, "__len__") else [float(item)])]

@@ -10,12 +10,41 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...errors import check_number, shape_of
+from ...errors import check_number, check_vector, shape_of
 from .. import surface_mesh
-from ..per_scene import Value, direction, extent, floats
 from ..surface_mesh import Array, SurfaceMesh
+from ..values import Value, direction, finite, numbers_of, shape_of_value
 from ..vectors import norm, unit
-from .base import Faces, SceneKey, SceneWords, Shape, numbers_of, split_along
+from .base import Faces, SceneKey, SceneWords, Shape, split_along
+
+
+def _checked_outline(name: str, outline: Any) -> Any:
+    """Polygon around the axis, anticlockwise; a tensor must be so."""
+    expected = f"{name} must be at least 3 pairs (distance >= 0, position along the axis)"
+    if isinstance(outline, Tensor) and outline.requires_grad:
+        raise ValueError(f"{name} must not require grad: which nodes are inside is not differentiable")
+    value = finite(name, outline)
+    shape = shape_of_value(value)
+    if len(shape) != 2 or shape[0] < 3 or shape[1] != 2:
+        raise ValueError(f"{expected}, got {shape_of(outline) if isinstance(outline, Tensor) else outline}")
+    numbers = numbers_of(value)
+    corners = tuple(zip(numbers[::2], numbers[1::2], strict=True))
+    if not corners:  # A tensor whose values are not read.
+        return value
+    if min(distance for distance, _ in corners) < 0:
+        raise ValueError(f"{expected}, got {outline}")
+    area = _polygon_area(corners)
+    if area == 0:
+        raise ValueError(f"{name} must enclose an area, got {outline}")
+    if isinstance(value, Tensor):
+        if area < 0:
+            raise ValueError(f"{name} as a tensor must be anticlockwise, got {outline}")
+        return value
+    return corners if area > 0 else corners[::-1]
+
+
+def _checked_axis(name: str, axis: Any) -> Any:
+    return None if axis is None else direction(name, axis)
 
 
 class Revolved(Shape):
@@ -30,6 +59,7 @@ class Revolved(Shape):
 
     name = "revolved"
     RANKS: ClassVar = {"axis": 1}
+    CHECKS: ClassVar = {"outline": _checked_outline, "axis": _checked_axis}
     arguments = ("outline", "axis")
     number, vector = 4, "axis"
     words = SceneWords(
@@ -42,8 +72,7 @@ class Revolved(Shape):
     )
 
     def __init__(self, outline: Sequence[Sequence[float]] | Tensor, axis: Value | None = None) -> None:
-        self.outline = extent("outline", outline) if isinstance(outline, Tensor) else _anticlockwise(outline)
-        self.axis = None if axis is None else direction("axis", axis)
+        self.outline, self.axis = outline, axis
 
     def surface(self, x: Tensor, scene: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """The normal is that of the nearest edge of the polygon, also where a reentrant corner is nearest."""
@@ -118,7 +147,7 @@ class Revolved(Shape):
         return axis / np.linalg.norm(axis)
 
     def thinnest_wall(self) -> float:
-        values = numbers_of(self.outline)
+        values = numbers_of(self.value_of("outline"))
         return _thinnest_of_polygon(list(zip(values[::2], values[1::2], strict=True)))
 
     def data_count(self) -> int:
@@ -145,25 +174,12 @@ class Cylinder(Revolved):
     number = 4  # a revolved rectangle
 
     def __init__(self, half_axis: Sequence[float], radius: float) -> None:
-        axis = floats("half_axis", direction("half_axis", half_axis))
+        axis = check_vector("half_axis", direction("half_axis", half_axis))
         if len(axis) != 3:
             raise ValueError("a cylinder needs three dimensions; in 2-D use a sphere (a disc) or a box")
         check_number("radius", radius, "positive", lambda v: 0 < v < math.inf)
         half = math.hypot(*axis)
         super().__init__(((0, -half), (radius, -half), (radius, half), (0, half)), axis)
-
-
-def _anticlockwise(outline: Any) -> tuple[tuple[float, ...], ...]:
-    """Polygon around the axis, checked."""
-    if not isinstance(outline, Sequence):
-        raise TypeError(f"outline must be at least 3 pairs, got {shape_of(outline)}")
-    corners = tuple(floats("outline", corner) for corner in outline)
-    if len(corners) < 3 or any(len(c) != 2 or c[0] < 0 or not all(map(math.isfinite, c)) for c in corners):
-        raise ValueError(f"outline must be at least 3 pairs (distance >= 0, position along the axis), got {outline}")
-    area = _polygon_area(corners)
-    if area == 0:
-        raise ValueError(f"outline must enclose an area, got {outline}")
-    return corners if area > 0 else corners[::-1]
 
 
 def _polygon_area(corners: Sequence[Sequence[float]]) -> float:

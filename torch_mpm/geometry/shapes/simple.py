@@ -11,10 +11,10 @@ from torch import Tensor
 
 from ...ops.pointwise import fuses, pointwise
 from .. import surface_mesh
-from ..per_scene import Value, constant, direction, extent
 from ..surface_mesh import Array, SurfaceMesh
+from ..values import Value, constant, direction, extent, numbers_of
 from ..vectors import norm, unit
-from .base import Faces, SceneKey, SceneWords, Shape, around_origin, ball_volume, numbers_of, one_face
+from .base import Faces, SceneKey, SceneWords, Shape, around_origin, ball_volume, one_face
 
 
 class Plane(Shape):
@@ -26,6 +26,7 @@ class Plane(Shape):
 
     name = "plane"
     RANKS: ClassVar = {"normal": 1}
+    CHECKS: ClassVar = {"normal": direction}
     arguments = ("normal",)
     is_smooth = is_convex = True
     number, vector = 0, "normal"
@@ -37,8 +38,10 @@ class Plane(Shape):
         },
     )
 
+    normal: Any  # Numbers or a tensor.
+
     def __init__(self, normal: Value) -> None:
-        self.normal = direction("normal", normal)
+        self.normal = normal
 
     def surface(self, x: Tensor, scene: Tensor | None = None) -> tuple[Tensor, Tensor]:
         normal = unit(self.at_nodes("normal", x, x.shape[1:], scene))
@@ -69,6 +72,7 @@ class Sphere(Shape):
 
     name = "sphere"
     RANKS: ClassVar = {"radius": 0}
+    CHECKS: ClassVar = {"radius": extent}
     arguments = ("radius",)
     is_smooth = is_convex = True
     number = 1
@@ -78,7 +82,7 @@ class Sphere(Shape):
     )
 
     def __init__(self, radius: float | Tensor) -> None:
-        self.radius = extent("radius", radius)
+        self.radius = radius
 
     def surface(self, x: Tensor, scene: Tensor | None = None) -> tuple[Tensor, Tensor]:
         return self.signed_distance(x, scene), unit(x)
@@ -111,6 +115,7 @@ class Box(Shape):
 
     name = "box"
     RANKS: ClassVar = {"size": 1}
+    CHECKS: ClassVar = {"size": extent}
     arguments = ("size",)
     is_convex = True
     number, vector = 2, "size"
@@ -120,7 +125,7 @@ class Box(Shape):
     )
 
     def __init__(self, size: Value) -> None:
-        self.size = extent("size", size)
+        self.size = size
 
     def surface(self, x: Tensor, scene: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """The normal is that of the nearest face, inside the one of the axis with the least negative distance."""
@@ -163,7 +168,7 @@ class Box(Shape):
         return [surface_mesh.cuboid(self.of_scene("size", 1, scene).numpy())]
 
     def thinnest_wall(self) -> float:
-        return min(numbers_of(self.size), default=math.inf)
+        return min(numbers_of(self.value_of("size")), default=math.inf)
 
     @classmethod
     def from_row(cls, vector: Tensor, radius: Tensor, data: Tensor) -> Box:
@@ -180,6 +185,7 @@ class Capsule(Shape):
 
     name = "capsule"
     RANKS: ClassVar = {"half_axis": 1, "radius": 0}
+    CHECKS: ClassVar = {"half_axis": constant, "radius": extent}
     arguments = ("half_axis", "radius")
     is_smooth = is_convex = True
     number, vector = 3, "half_axis"
@@ -193,7 +199,7 @@ class Capsule(Shape):
     )
 
     def __init__(self, half_axis: Value, radius: float | Tensor) -> None:
-        self.half_axis, self.radius = constant("half_axis", half_axis), extent("radius", radius)
+        self.half_axis, self.radius = half_axis, radius
 
     def surface(self, x: Tensor, scene: Tensor | None = None) -> tuple[Tensor, Tensor]:
         offset = self._offset(x, scene)

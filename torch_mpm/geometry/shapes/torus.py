@@ -9,9 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ...cuda_graphs.capture import is_readable
 from .. import surface_mesh
-from ..per_scene import Value, direction, extent
 from ..surface_mesh import Array, SurfaceMesh
+from ..values import Value, direction, extent
 from ..vectors import norm, unit
 from .base import Faces, SceneKey, SceneWords, Shape, around_origin, ball_volume, one_face, split_along
 
@@ -26,6 +27,7 @@ class Torus(Shape):
 
     name = "torus"
     RANKS: ClassVar = {"ring": 1, "radius": 0}
+    CHECKS: ClassVar = {"ring": direction, "radius": extent}
     arguments = ("ring", "radius")
     is_smooth = True
     number, vector = 6, "ring"
@@ -40,11 +42,13 @@ class Torus(Shape):
     )
 
     def __init__(self, ring: Value, radius: float | Tensor) -> None:
-        self.ring, self.radius = direction("ring", ring), extent("radius", radius)
-        if isinstance(self.ring, Tensor) or isinstance(self.radius, Tensor):
-            return
-        if not self.radius < math.hypot(*self.ring):
-            raise ValueError(f"radius must be below that of the circle, {math.hypot(*self.ring):g} m, got {radius}")
+        self.ring, self.radius = ring, radius
+        given = self.value_of("ring"), self.value_of("radius")
+        if all(is_readable(value) for value in given if isinstance(value, Tensor)):
+            axis, small = (torch.as_tensor(value, dtype=torch.float64, device="cpu").detach() for value in given)
+            circle = axis.norm(dim=-1)
+            if not bool((small < circle).all()):
+                raise ValueError(f"radius must be below that of the circle, {circle.tolist()} m, got {radius}")
 
     def surface(self, x: Tensor, scene: Tensor | None = None) -> tuple[Tensor, Tensor]:
         ring = self.at_nodes("ring", x, x.shape[1:], scene)
