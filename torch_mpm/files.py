@@ -21,7 +21,9 @@ KINDS = {
 }
 
 
-def check_file(path: str | Path, kind: str, largest: int | None = LARGEST, may_be_empty: bool = False) -> None:
+def check_file(
+    path: str | os.PathLike[str], kind: str, largest: int | None = LARGEST, may_be_empty: bool = False
+) -> None:
     """Raise unless a path is a readable regular file of bounded size that is not empty. Links are followed.
 
     Args:
@@ -32,7 +34,10 @@ def check_file(path: str | Path, kind: str, largest: int | None = LARGEST, may_b
 
     Raises:
         OSError: with the path; also as FileNotFoundError, IsADirectoryError or PermissionError.
+        TypeError: for anything but a path.
     """
+    if not isinstance(path, (str, os.PathLike)):
+        raise TypeError(f"{kind} file must be given by its path, got {type(path).__name__}")
     try:
         status = os.stat(path)
         if stat.S_ISREG(status.st_mode):

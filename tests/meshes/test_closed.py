@@ -198,3 +198,44 @@ def test_a_mesh_whose_vertices_change_is_looked_up_anew():
     assert not cube.contains(x)
     cube.vertices.numpy()[:] *= 2
     assert cube.contains(x)
+
+
+# ---- files and triangles with faults of their writers
+
+
+@pytest.mark.parametrize("first", ["", "# a comment\n"])
+@pytest.mark.parametrize("suffix", [".obj", ".OBJ"])
+def test_a_byte_order_mark_hides_no_vertex(suffix, first, tmp_path):
+    """An unused vertex at the end would hide that all indices are shifted."""
+    mesh, path = cube(0.4), tmp_path / f"cube{suffix}"
+    lines = [f"v {x} {y} {z}" for x, y, z in [*mesh.vertices.tolist(), (0.0, 0.0, 0.0)]]
+    lines += ["f {} {} {}".format(*(face + 1)) for face in mesh.faces]
+    path.write_bytes(b"\xef\xbb\xbf" + (first + "\n".join(lines)).encode())
+    assert shapes.Mesh(path).volume(3) == pytest.approx(0.064)
+
+
+@pytest.mark.parametrize("turn", [1, -1])
+@pytest.mark.parametrize("again", [1, 3, 11])
+def test_triangles_that_are_listed_again(again, turn):
+    mesh = cube(0.4)
+    faces = np.concatenate([mesh.faces, mesh.faces[:again, ::turn]])
+    with pytest.warns(UserWarning, match=f"{again} triangles that were listed again were left out"):
+        shape = shapes.Mesh(trimesh.Trimesh(mesh.vertices, faces, process=False))
+    assert shape.volume(3) == pytest.approx(0.064) and len(shape.faces) == 12
+
+
+@pytest.mark.parametrize("mesh", [cube(0.4), icosphere(2, 0.3), trimesh.creation.torus(0.3, 0.1)], ids=str)
+def test_parts_that_cancel_enclose_nothing(mesh):
+    mesh = mesh.copy()
+    mesh.apply_translation((0.5, 0.31, 0.2))
+    both = parts(mesh, inverted(mesh.copy()))
+    with pytest.raises(ValueError, match="encloses no volume: its winding number is zero everywhere"):
+        mpm.seed.mesh(both, mpm.Grid(0.05, (-1,) * 3, (1,) * 3))
+
+
+@pytest.mark.parametrize("source", [([[0.0, 0.0, 0.0]], [[0, 0, 0]]), 3, b"cube.obj", None, np.zeros((3, 3))])
+def test_sources_of_another_type(source):
+    message = "source must be the path of a mesh file or a trimesh.Trimesh, got "
+    for make in (shapes.Mesh, lambda v: mpm.seed.mesh(v, 0.1), closed.load):
+        with pytest.raises(TypeError, match=message):
+            make(source)

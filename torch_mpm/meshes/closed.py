@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import codecs
+import os
 import warnings
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -9,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .. import optional
+from ..errors import shape_of
 from ..files import check_file
 from ..geometry.surface_mesh import Array
 
@@ -31,12 +34,14 @@ class ClosedMesh(NamedTuple):
 def load(source: str | Path | Any) -> ClosedMesh:
     """A closed mesh, from a file that trimesh reads (.obj, .ply, .stl, .glb, ...) or of a `trimesh.Trimesh`.
 
-    Where it is open, vertices at the same position are merged, as files with textures or normals need; then vertices on
-    open edges within `MERGED` of each other. Where triangles of one part have opposite orientations, those with the
-    smaller total area are reversed. All changes except the first, which is lossless, warn.
+    Where it is open, vertices at the same position are merged, as files with textures or normals need; triangles that
+    are listed again are left out; then vertices on open edges within `MERGED` of each other are merged. Where triangles
+    of one part have opposite orientations, those with the smaller total area are reversed. All changes except the first,
+    which is lossless, warn.
 
     Raises:
         ImportError: without trimesh, or without scipy for the last two changes.
+        TypeError: for a source of another type.
         OSError: for a file that cannot be read.
         ValueError: for a file without triangles, coordinates that are not finite, or a mesh that is not closed.
     """
@@ -45,6 +50,11 @@ def load(source: str | Path | Any) -> ClosedMesh:
     if len(_open_edges(faces)):
         vertices, faces, merged = merged_equal(vertices, faces)
         changes += [f"{merged} vertices at positions of others were merged"] if merged else []
+    if len(_open_edges(faces)):
+        faces, again = _without_repetitions(faces)
+        if again:
+            changes.append(f"{again} triangles that were listed again were left out")
+            _warn(source, changes[-1])
     if len(_open_edges(faces)):
         vertices, faces, merged, distance = _merged_near(vertices, faces)
         if merged:
@@ -71,10 +81,12 @@ def triangles(source: str | Path | Any) -> tuple[Array, Array]:
     """
     trimesh = optional.load("trimesh", "a mesh shape", "mesh")
     mesh: Any = source
+    if not isinstance(source, (trimesh.Trimesh, str, os.PathLike)):
+        raise TypeError(f"source must be the path of a mesh file or a trimesh.Trimesh, got {shape_of(source)}")
     if not isinstance(source, trimesh.Trimesh):
         check_file(source, "mesh")
         try:
-            mesh = trimesh.load(source, force="mesh", resolver=_resolver(source))
+            mesh = _read(Path(source))
         except Exception as error:  # Readers of many formats raise any kind of exception.
             raise ValueError(f"mesh file {source} cannot be read: {type(error).__name__}: {error}") from error
         if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
@@ -87,6 +99,17 @@ def triangles(source: str | Path | Any) -> tuple[Array, Array]:
     if not np.isfinite(vertices).all():
         raise ValueError(f"vertices of mesh {source} must be finite")
     return vertices, _without_points(faces)
+
+
+def _read(path: Path) -> Any:
+    """A file read by trimesh, which would skip a line of an .obj that begins with a byte order mark."""
+    import trimesh
+
+    kind = path.suffix.lower().removeprefix(".")
+    with path.open("rb") as file:
+        if kind != "obj" or file.read(len(codecs.BOM_UTF8)) != codecs.BOM_UTF8:
+            return trimesh.load(str(path), force="mesh", resolver=_resolver(path))
+        return trimesh.load(file, file_type=kind, force="mesh", resolver=_resolver(path))
 
 
 def edge_uses(faces: Array) -> tuple[Array, Array, Array]:
@@ -116,6 +139,16 @@ def _resolver(path: str | Path) -> Any:
 def _without_points(faces: Array) -> Array:
     """Triangles with three different vertices."""
     return faces[(faces != np.roll(faces, 1, axis=1)).all(1)]
+
+
+def _without_repetitions(faces: Array) -> tuple[Array, int]:
+    """Triangles of different corners, the first of each, and the number of those left out; all where fewer triangles
+    leave as many edges open."""
+    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    kept = faces[np.sort(first)]
+    if len(_open_edges(kept)) >= len(_open_edges(faces)):
+        return faces, 0
+    return kept, len(faces) - len(kept)
 
 
 def _open_edges(faces: Array) -> Array:

@@ -27,6 +27,10 @@ UNLIKE = 1e-3
 """Relative difference between the volume inside a mesh and that by its normals from which on it is reported."""
 
 
+ROUNDING = 1e-12
+"""Share of the volume of its bounding box up to which the volume inside a mesh is rounding."""
+
+
 class Mesh(Shape):
     """Inside of a closed triangle mesh, scaled about its origin: points of non-zero winding number.
 
@@ -67,6 +71,11 @@ class Mesh(Shape):
         self.changes, self._index = mesh.changes, MeshIndex(self.vertices, self.faces)
         signed, filled = self._index.volumes
         check_number(f"the volume of {self.name} {source}", filled, "positive", lambda v: 0 < v < math.inf)
+        if filled <= ROUNDING * float((self.vertices.amax(0) - self.vertices.amin(0)).prod()):
+            raise ValueError(
+                f"{self.name} {source} encloses no volume: its winding number is zero everywhere, as where parts of "
+                "opposite orientation coincide; remove one of them"
+            )
         return signed, filled
 
     def surface(self, x: Tensor, scene: Tensor | None = None) -> tuple[Tensor, Tensor]:
