@@ -339,3 +339,52 @@ def test_ids_of_an_activation_are_checked():
     for ids, message in ((torch.arange(3), "ids must have shape"), (torch.arange(4).int(), "ids must be int64")):
         with pytest.raises((TypeError, ValueError), match=message):
             mpm.Grid(0.1, (0, 0), (1, 1)).activate(x, ids=ids)
+
+
+# ---- dimensions
+
+
+def of_dimension(dim: int) -> tuple[mpm.Grid, mpm.State]:
+    lattice = mpm.Grid(0.1, (0,) * dim, (1,) * dim)
+    return lattice, mpm.State.at_rest(seed.box((0.3,) * dim, (0.5,) * dim, lattice), 1000.0)
+
+
+OF_STATES = {
+    "step": lambda step, state: step(state, 1e-3),
+    "rollout": lambda step, state: mpm.rollout(step, state, 2, 1e-3),
+    "rollout_to": lambda step, state: mpm.rollout_to(step, state, 1e-2),
+    "frames": lambda step, state: list(mpm.frames(step, state, 2, 1e-3)),
+    "environments": lambda step, state: mpm.Environments(step, [state]).advance(1, 1e-3),
+    "stable_dt": lambda step, state: step.stable_dt(state),
+    "project": lambda step, state: step.project(state),
+    "impulses": lambda step, state: step.with_impulses(state),
+}
+
+
+@pytest.mark.parametrize("use", OF_STATES)
+@pytest.mark.parametrize("dim", [2, 3])
+def test_states_of_another_dimension(dim, use):
+    (lattice, _), (_, other) = of_dimension(dim), of_dimension(5 - dim)
+    message = rf"x of the state must have the dimension of the grid, \[P, {dim}\], got \[{len(other)}, {5 - dim}\]"
+    with pytest.raises(ValueError, match=message):
+        OF_STATES[use](mpm.Step(lattice, law()), other)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_shapes_of_another_dimension(dim):
+    lattice, other = of_dimension(dim)[0], (0.4,) * (5 - dim)
+    message = f"shape must have the dimension of the grid, {dim}, got one of {5 - dim} dimensions"
+    for make in (lambda: seed.sphere(other, 0.2, lattice), lambda: seed.box((0.1,) * (5 - dim), other, lattice)):
+        with pytest.raises(ValueError, match=message):
+            make()
+
+
+def test_positions_of_other_particles_than_were_activated():
+    """They are named, and not the scenes of the activation."""
+    x = torch.rand(5, 2)
+    active = grid(scenes=2).activate(x, torch.zeros(5, dtype=torch.int32))
+    for use in (g2p, lambda b, x, v: gather(b, x, v)):
+        with pytest.raises(
+            ValueError, match=r"x must have the shape of the positions that were activated.* got \[3, 2\]"
+        ):
+            use(active, x[:3], torch.zeros(active.node_count, 2))

@@ -176,10 +176,11 @@ def check_positions(x: Tensor, dim: int, scene: Tensor | None, scenes: int) -> N
 
 def check_particles(x: Tensor, blocks: Any) -> None:
     """Check that positions belong to the particles of an activation, as far as their number shows."""
-    check_positions(x, blocks.grid.dim, blocks.scene, blocks.grid.scenes)
+    check_positions(x, blocks.grid.dim, None, 1)
     if x.shape[0] != blocks.index.shape[0]:
         expected = f"[P, D] = [{blocks.index.shape[0]}, {blocks.grid.dim}]"
         raise ValueError(f"x must have the shape of the positions that were activated, {expected}, got {shape_of(x)}")
+    check_positions(x, blocks.grid.dim, blocks.scene, blocks.grid.scenes)
 
 
 def check_index(name: str, index: Tensor | None, x: Tensor, dtype: torch.dtype = torch.int32, of: str = "x") -> None:

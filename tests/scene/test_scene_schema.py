@@ -344,3 +344,21 @@ def test_a_missing_material_is_not_told_twice():
     with pytest.raises(SceneError) as error:
         Scene(**words)
     assert len(error.value.problems) == 1
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ((float("nan"), 0.0), "gravity[0]: should be a finite number, got nan"),
+        (("a", 1.0), "gravity[0]: should be a valid number"),
+        ((1.0,), "gravity: should have at least 2 entries, not 1, got (1.0,)"),
+        ((1.0,) * 4, "gravity: should have at most 3 entries, not 4, got"),
+    ],
+)
+def test_invalid_entries_are_not_missing_ones(given, message):
+    grid = {"lower": (0, 0), "upper": (1, 1), "dx": 0.1}
+    with pytest.raises(ValueError) as error:
+        mpm.Scene(grid=grid, gravity=given, duration=1.0)
+    lines = [line for line in str(error.value).splitlines() if "gravity" in line]
+    assert message in lines[0] and not any("item" in line for line in lines)
+    assert not any("entries" in line for line in lines[1:])

@@ -259,3 +259,15 @@ def test_a_column_bears_its_weight():
     across = lam * J.log() / J
     torch.testing.assert_close(field(step, rest, "out_of_plane_stress")[low], across[low], rtol=1e-6, atol=0)
     torch.testing.assert_close(field(step, rest, "pressure")[low], -(weight + 2 * across)[low] / 3, rtol=0, atol=98.1)
+
+
+@pytest.mark.parametrize(
+    ("name", "near"),
+    [("strees", "stress"), ("presure", "pressure"), ("velocty", "velocity"), ("mass!", None), (3, None)],
+)
+def test_unknown_fields(name, near):
+    step = mpm.Step(mpm.Grid(0.1, (0, 0), (1, 1)), mpm.NeoHookean(E=1e4, nu=0.3))
+    state = step.prepare(mpm.State.at_rest(mpm.seed.box((0.3, 0.3), (0.5, 0.5), 0.1), 1000.0))
+    with pytest.raises(ValueError, match=r"name of a field must be one of position, .* got ") as error:
+        field(step, state, name)
+    assert near is None or str(error.value).endswith(f"did you mean {near!r}?")

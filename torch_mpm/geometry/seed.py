@@ -230,6 +230,9 @@ def fill(
     """
     if missing := [name for name in ("lower", "upper", "volume", "inside") if not hasattr(shape, name)]:
         raise TypeError(f"shape must be a shape of torch_mpm.seed, got {shape_of(shape)} without {missing[0]}")
+    dim = getattr(grid, "dim", len(shape.lower))
+    if len(shape.lower) != dim:
+        raise ValueError(f"shape must have the dimension of the grid, {dim}, got one of {len(shape.lower)} dimensions")
     check_dtype(dtype)
     check_device(device)
     if isinstance(seed, bool) or not isinstance(seed, numbers.Integral) or not -(2**63) <= seed < 2**64:

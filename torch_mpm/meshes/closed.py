@@ -36,7 +36,7 @@ def load(source: str | Path | Any) -> ClosedMesh:
 
     Where it is open, vertices at the same position are merged, as files with textures or normals need; triangles that
     are listed again are left out; then vertices on open edges within `MERGED` of each other are merged. Where triangles
-    of one part have opposite orientations, those with the smaller total area are reversed. All changes except the first,
+    of one part have opposite orientations, those with the smaller total area are reversed. All changes but the first,
     which is lossless, warn.
 
     Raises:

@@ -64,7 +64,13 @@ def _unwritable(words: Any, path: str) -> Iterator[str]:
 
 def explain(error: ValidationError, root: type[BaseModel] = SceneData) -> list[str]:
     """One line per problem of a validation against ``root``."""
-    return [_line(item, root) for item in error.errors(include_url=False)]
+    problems = error.errors(include_url=False)
+    return [_line(item, root) for item in problems if not _lacks_invalid_entries(item)]
+
+
+def _lacks_invalid_entries(item: Any) -> bool:
+    """Whether a list is too short only without its invalid entries, each of which is a problem of its own."""
+    return bool(item["type"] == "too_short" and len(item["input"]) >= item["ctx"]["min_length"])
 
 
 def _line(item: Any, root: type[BaseModel]) -> str:
@@ -87,6 +93,10 @@ def _line(item: Any, root: type[BaseModel]) -> str:
         return f"{path}: missing{takes}"
     if kind == "string_pattern_mismatch":
         return f"{path}: takes {description}, got {given!r}"
+    if kind in ("too_short", "too_long"):
+        least = kind == "too_short"
+        count = f"at least {item['ctx']['min_length']}" if least else f"at most {item['ctx']['max_length']}"
+        return f"{path}: should have {count} entries, not {len(given)}, got {given!r}{takes}"
     message = item["msg"][0].lower() + item["msg"][1:]
     return f"{path}: {message.removeprefix('input ')}, got {given!r}{takes}"
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import difflib
+
 import torch
 from torch import Tensor
 
@@ -15,6 +17,8 @@ RANKS = {
     **{"von_mises_stress": 0, "pressure": 0, "temperature": 0, "liquid": 0},
 }
 """Number of axes of a field beside that of the particles, each of length D."""
+NAMES = ("position", "velocity", *RANKS)
+"""Names of fields."""
 
 
 def field(step: Step, state: State, name: str, kirchhoff: Tensor | None = None) -> Tensor | None:
@@ -30,9 +34,11 @@ def field(step: Step, state: State, name: str, kirchhoff: Tensor | None = None) 
         kirchhoff: result of `step.law.stress`, if known.
 
     Raises:
-        ValueError: for "out_of_plane_stress" in 3-D.
+        ValueError: for an unknown field, with the nearest known one; for "out_of_plane_stress" in 3-D.
         NotImplementedError: for a law without an out-of-plane stress, where it is needed.
     """
+    if name not in NAMES:
+        raise ValueError(f"name of a field must be one of {', '.join(NAMES)}, got {name!r}{_nearest(name)}")
     if name in MEASURES:
         return stress_field(step, with_C(state), name, kirchhoff)
     if name == "liquid":
@@ -41,6 +47,11 @@ def field(step: Step, state: State, name: str, kirchhoff: Tensor | None = None) 
         return state.temperature + step.heat.reference
     value: Tensor | None = getattr(state, {"position": "x", "velocity": "v"}.get(name, name))
     return with_C(state).C if value is None and name == "C" else value
+
+
+def _nearest(name: object) -> str:
+    near = difflib.get_close_matches(str(name), NAMES, 1)
+    return f": did you mean {near[0]!r}?" if near else ""
 
 
 def stress_field(step: Step, state: State, name: str, kirchhoff: Tensor | None = None) -> Tensor:

@@ -250,6 +250,7 @@ class Step(TensorModule):
         """A state with all fields that this step needs."""
         check_state(state)
         state.check_assigned()
+        self._check_dimension(state)
         law = self.law
         changes: dict[str, Any] = {}
         if "F" in law.state_fields and state.F is None:
@@ -262,6 +263,12 @@ class Step(TensorModule):
             check_impulse(self, state)
         state = (state.replace(**changes) if changes else state).of_scenes(self.grid.scenes)
         return state if self.heat is None else self.heat.prepare(state)
+
+    def _check_dimension(self, state: State) -> None:
+        if state.x.shape[1] != self.grid.dim:
+            raise ValueError(
+                f"x of the state must have the dimension of the grid, [P, {self.grid.dim}], got {shape_of(state.x)}"
+            )
 
     def with_residual(self, state: State, dt: float | Tensor) -> State:
         """A state whose positions are compensated from here on, if steps of dt [s] need it; see `compensated`.
@@ -403,6 +410,7 @@ class Step(TensorModule):
             The state, and the numbers of particles that were moved, int64 [B].
         """
         check_state(state)
+        self._check_dimension(state)
         x, moved = project(self.boundaries.entries, self.walls, self.grid, state)
         scenes = self.grid.scenes
         if state.scene is None:
@@ -417,6 +425,7 @@ class Step(TensorModule):
         Read them with `impulses`. A state whose `impulse` is None counts none, at no cost.
         """
         check_state(state)
+        self._check_dimension(state)
         return state.replace(impulse=no_impulse(self, state.x))
 
     def impulses(self, state: State) -> Impulses:
