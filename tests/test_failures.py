@@ -116,6 +116,33 @@ def test_one_report_for_all_kinds(device):
     assert len(message.splitlines()) == 4
 
 
+@pytest.mark.parametrize("integrator", ["explicit", "implicit"])
+@pytest.mark.parametrize("n", [1, 3])
+def test_positions_after_the_latest_step_are_checked(n, integrator, device):
+    """They left the grid, or became NaN, in that step: no step has read them yet."""
+    step, state = batch(3, device)
+    step.integrator = integrator
+    state = state.replace(v=torch.zeros_like(state.v))
+    state = mpm.rollout(step, state, n - 1, 1e-3) if n > 1 else state
+    v = state.v.clone()
+    row = first_of(state, 1) + 2
+    v[state.scene == 1] = 1e6
+    after = step(state.replace(v=v), 1e-3)
+    step.check()
+    x = after.x.clone()
+    x[row] = torch.nan
+    failures = step.failures(after.replace(x=x))
+    assert failures.failed.tolist() == [False, True, False]
+    outside, lost = failures.problems["outside"], failures.problems["not_finite"]
+    count = int((state.scene == 1).sum())
+    assert outside.count.tolist() == [0, count - 1, 0] and outside.first.tolist()[1] == first_of(state, 1)
+    assert lost.count.tolist() == [0, 1, 0] and lost.first.tolist()[1] == row and lost.step.tolist()[1] == n
+    with pytest.raises(mpm.SimulationError, match=f"{count} particles left the grid.*first at step {n}"):
+        step.check(after)
+    step.check(state)
+    step.check()
+
+
 def test_many_scenes_are_counted(device):
     step, state = batch(20, device)
     step(state.replace(x=torch.full_like(state.x, torch.nan)), 1e-3)

@@ -10,7 +10,7 @@ from torch_mpm.implicit.line_search import Point, Search
 
 
 class TwoScenes:
-    """Two nodes, each a scene with the energy of a spring, v²."""
+    """Two nodes, each a scene with the energy of a spring, v², and without limits of the stretch."""
 
     def of_nodes(self, value):
         return value[:, None]
@@ -24,6 +24,15 @@ class TwoScenes:
 
     def gain(self, v, residual, trial, change):
         return change
+
+    def trial(self, v):
+        return v
+
+    def squared_stretch(self, trial):
+        return torch.inf
+
+    def exceeds(self, v, most):
+        return torch.zeros(2, dtype=torch.bool)
 
 
 @pytest.mark.parametrize("wrong", [8.0, float("nan")])

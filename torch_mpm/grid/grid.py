@@ -225,6 +225,10 @@ class Grid(Lattice):
         )
         return Blocks(self, table, block, offsets, index, schedule, scene, status)
 
+    def status_at(self, x: Tensor, scene: Tensor | None, previous: Tensor | None, ids: Tensor | None) -> Tensor:
+        """Status that an activation would have after a previous one; arguments as in `activate`."""
+        return self._activate(x, scene, previous, 0, ids).status
+
     def _grow(self, x: Tensor, scene: Tensor | None) -> None:
         """Increase `max_blocks` ahead of the required blocks; reads the device only in the first call."""
         if self.max_blocks is None:

@@ -17,8 +17,9 @@ def equilibrium(step: Step, state: State, dt: float) -> State:
     """State at rest under gravity, walls and obstacles: one implicit step, so long that inertia vanishes.
 
     The shape functions are those of the given positions, so that the displacements may be any (total Lagrangian on the
-    lattice). A body without supports falls as far as it does in dt. A body one particle thick has no bending stiffness,
-    so that the solve of one that is held at one end does not converge.
+    lattice). A body without supports falls as far as it does in dt, and `step.check` of the result reports particles
+    outside the grid. A body one particle thick has no bending stiffness, so that the solve of one that is held at one
+    end does not converge.
 
     Args:
         step: a step with `integrator="implicit"`; static loads need a tolerance of 1e-6 or less.

@@ -19,6 +19,10 @@ MOST_HALVINGS = 60
 """Maximum number of halvings of a step: where a body resists only after it has moved, as a cable across its span,
 the first step of a static load is as long as the body would fall.
 """
+STRETCH = 4
+"""Maximum factor of |F|² of a particle in one iteration, as a stretch by e along one axis. The energy of logarithmic
+strain grows so slowly beyond it that a supported body in a long step has less energy torn off and falling than at rest.
+"""
 
 
 class Point(NamedTuple):
@@ -38,40 +42,54 @@ def starting_point(system: ImplicitSystem, bounds: NodeBounds | None) -> tuple[P
 
     These are v* within bounds or no motion, whichever has less energy; where neither has a finite energy, a share of v*
     that has. The iteration begins there, or at the velocities before gravity where these have still less energy, as in
-    a body that is held and moves slowly.
+    a body that is held and moves slowly. Velocities that stretch a particle too much are the last choice.
     """
-    plain = _lower(system, _point(system, bounds, system.start), _point(system, bounds, torch.zeros_like(system.start)))
+    plain = _lower(
+        system, _candidate(system, bounds, system.start), _candidate(system, bounds, torch.zeros_like(system.start))
+    )
     lost, share = ~plain.energy.isfinite(), 1.0
     for _ in range(MOST_HALVINGS):
         if not bool(lost.any()):
             break
         share /= 2
-        part = _point(system, bounds, share * system.start)
+        part = _candidate(system, bounds, share * system.start)
         plain = _lower(system, plain, part._replace(energy=torch.where(lost, part.energy, torch.inf)))
         lost = ~plain.energy.isfinite()
     begun = plain
     if system.before_gravity is not None:
-        begun = _lower(system, plain, _point(system, bounds, system.before_gravity))
+        begun = _lower(system, plain, _candidate(system, bounds, system.before_gravity))
     system.reference = begun.v
     return Point(begun.v, *system.energy(begun.v)), plain.v
 
 
-def _point(system: ImplicitSystem, bounds: NodeBounds | None, v: Tensor) -> Point:
+class _Candidate(NamedTuple):
+    """Candidate for the start: a `Point`, and scenes in which it stretches a particle too much, bool [B]."""
+
+    v: Tensor
+    energy: Tensor
+    size: Tensor
+    rounded: Tensor
+    torn: Tensor
+
+
+def _candidate(system: ImplicitSystem, bounds: NodeBounds | None, v: Tensor) -> _Candidate:
     """Nearest velocities within bounds."""
     v = v if bounds is None else bounds.clamped(v)
-    return Point(v, *system.energy(v))
+    return _Candidate(v, *system.energy(v), system.exceeds(v, STRETCH * system.squared_stretch(system.state)))
 
 
-def _lower(system: ImplicitSystem, a: Point, b: Point) -> Point:
-    """For each scene the point of less energy."""
-    lower = b.energy < torch.where(a.energy.isfinite(), a.energy, torch.inf)
+def _lower(system: ImplicitSystem, a: _Candidate, b: _Candidate) -> _Candidate:
+    """For each scene the candidate of less energy, of those that are not torn if possible."""
+    less = b.energy < torch.where(a.energy.isfinite(), a.energy, torch.inf)
+    lower = torch.where(b.energy.isfinite() & a.energy.isfinite() & (a.torn != b.torn), a.torn, less)
     rest = (torch.where(lower, y, x) for x, y in zip(a[1:], b[1:], strict=True))
-    return Point(torch.where(system.of_nodes(lower), b.v, a.v), *rest)
+    return _Candidate(torch.where(system.of_nodes(lower), b.v, a.v), *rest)
 
 
 class Search:
     """Longest of the steps 1, ½, ¼ ... that decreases the energy of each scene sufficiently, including dissipation by
-    friction. It begins with the whole step; the host waits for it only in `too_long`.
+    friction, and stretches no particle by more than `STRETCH`. It begins with the whole step; the host waits for it
+    only in `too_long`.
 
     Args:
         system, bounds: system and bounds of the velocities.
@@ -98,6 +116,7 @@ class Search:
     ) -> None:
         self._system, self._bounds, self._limit, self._residual = system, bounds, limit, residual
         self._start, self._end = start, end
+        self._most = STRETCH * system.squared_stretch(system.trial(start.v))
         self._rubbed = residual
         if limit is not None and bounds is not None:
             self._rubbed = residual + limit.slope(bounds, start.v)
@@ -137,6 +156,7 @@ class Search:
         changed = system.node_sum(v != start.v) > 0  # A step below rounding helps no more than one of zero length.
         self._share = torch.where(changed, self._share, 0.0)
         point = Point(v, *system.energy(v))
+        torn = system.exceeds(v, self._most)
         gain = system.gain(start.v, self._residual, v, point.energy - start.energy)
         change = v - start.v if self._bounds is None else self._bounds.change(start.v, v)
         slope = system.node_sum(self._rubbed * change)
@@ -146,4 +166,4 @@ class Search:
             slope = slope + excess
         rounding = ROUNDING * torch.finfo(v.dtype).eps * (start.rounded + point.rounded)
         enough = gain <= SUFFICIENT * slope + rounding
-        return point, (enough & point.energy.isfinite() & (slope <= 0)) | (self._share == 0)
+        return point, (enough & ~torn & point.energy.isfinite() & (slope <= 0)) | (self._share == 0)

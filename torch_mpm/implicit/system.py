@@ -138,6 +138,21 @@ class ImplicitSystem:
         gradient = self.trial(v).C.double() * (self.step[:, None, None] if isinstance(self.step, Tensor) else self.step)
         return self.particle_sum((self.stiffness * gradient.square().sum((1, 2)))[:, None])[:, 0]
 
+    def squared_stretch(self, state: Any) -> Tensor:
+        """|F|² of the particles of a state [P], infinite for laws without a deformation gradient and particles without
+        energy.
+        """
+        if state.F is None:
+            return torch.full_like(self.volume, torch.inf)
+        return torch.where(self.volume > 0, state.F.square().sum((1, 2)), torch.inf)
+
+    def exceeds(self, v: Tensor, most: Tensor) -> Tensor:
+        """Scenes in which the trial |F|² of a particle exceeds a limit [P], bool [B]."""
+        trial = self.trial(v)
+        if trial.F is None:
+            return torch.zeros(self.blocks.grid.scenes, dtype=torch.bool, device=v.device)
+        return self.particle_sum((trial.F.square().sum((1, 2)) > most).double()[:, None])[:, 0] > 0
+
     def gain(self, v: Tensor, residual: Tensor, trial: Tensor, change: Tensor) -> Tensor:
         """Change of E in a step from v, whose residual is given, to a trial, float64 [B] [J]; with plastic flow, which
         leaves no energy, the work of the residuals along the step by the trapezoidal rule.

@@ -50,9 +50,10 @@ class Environments:
 
     Attributes:
         state: all scenes. `reset` overwrites its fields where none requires a gradient: clone a state that must stay.
-            It may be replaced by one with the same number of particles, such as with another velocity. Absent particles
-            have no volume, and a mass of one.
-        time: time of each scene since it began [B] [s], float64.
+            It may be replaced by one with the same number of particles, such as with another velocity; if its time is
+            a tensor [B], the clocks follow it, and a number is replaced by the clocks. Absent particles have no volume,
+            and a mass of one.
+        time: time of each scene since it began [B] [s], float64; that of `state`.
         frozen: scenes that are not advanced until they are reset, bool [B].
 
     Differentiable as `rollout`, from call to call, by everything in the step and the states that requires a gradient.
@@ -78,15 +79,30 @@ class Environments:
         self.room = max(len(s) for s in states) if room is None else check_count("room", room)
         self.first = self.pack(states)
         """The scenes that `reset` uses by default."""
-        self.state = self._placed(self.first.map(torch.clone))
-        device = self.state.x.device
-        self.time = torch.zeros(step.grid.scenes, dtype=torch.float64, device=device)
+        state = self._placed(self.first.map(torch.clone))
+        device = state.x.device
+        self._state = state.replace(time=torch.zeros(step.grid.scenes, dtype=torch.float64, device=device))
         self.frozen = torch.zeros(step.grid.scenes, dtype=torch.bool, device=device)
         self._froze = False  # Whether a scene was ever frozen; its laws are evaluated all the same.
         self._before: tuple[Tensor, Tensor] | None = None
 
     def __len__(self) -> int:
         return self.step.grid.scenes
+
+    @property
+    def state(self) -> State:
+        return self._state
+
+    @state.setter
+    def state(self, state: State) -> None:
+        time = state.scene_time
+        self._state = state if time is not None and time.shape == (len(self),) else state.replace(time=self.time)
+
+    @property
+    def time(self) -> Tensor:
+        time = self._state.scene_time
+        assert time is not None
+        return time
 
     def pack(self, states: Sequence[State]) -> State:
         """Scenes for repeated use by `reset`: n states of one scene each, R rows for each, `scene` 0 or -1.
@@ -137,17 +153,15 @@ class Environments:
         see `Obstacle`.
         """
         check_count("n", n)
-        state = self.state
+        state, time = self.state, self.time
         split_dt(dt, len(self), state.x)  # checks dt
-        if self.step.reads_time:
-            state = state.replace(time=self.time)
-        elapsed = dt.double() if isinstance(dt, Tensor) else torch.full_like(self.time, dt)
+        elapsed = dt.double() if isinstance(dt, Tensor) else torch.full_like(time, dt)
         elapsed = torch.where(self.frozen | ~(elapsed > 0), 0.0, n * elapsed)
-        impulse = state.impulse
-        after = rollout(self.step, state, n, dt).replace(time=0.0)
-        self.state = standing(self.state, after, self.present.reshape(-1)) if self._froze else after
-        self.time = self.time + elapsed
-        self._before = None if impulse is None else (impulse, elapsed)
+        # Steps with a tensor time take longer.
+        after = rollout(self.step, state if self.step.reads_time else state.replace(time=0.0), n, dt)
+        after = after.replace(time=time + elapsed)
+        self.state = standing(state, after, self.present.reshape(-1)) if self._froze else after
+        self._before = None if state.impulse is None else (state.impulse, elapsed)
 
     @property
     def failed(self) -> Tensor:
@@ -156,7 +170,7 @@ class Environments:
 
     def detach(self) -> None:
         """Cut the gradient here: later losses have no gradient from previous steps, whose memory is freed."""
-        self.state, self.time = self.state.detach(), self.time.detach()
+        self.state = self.state.detach()
         if self._before is not None:
             self._before = self._before[0].detach(), self._before[1].detach()
 
@@ -216,9 +230,9 @@ class Environments:
 
     def _begin_anew(self, mask: Tensor) -> None:
         """Clocks, impulses and status of scenes."""
-        self.time = torch.where(mask, 0.0, self.time)
         self.frozen = self.frozen & ~mask
-        self.state = self.state.with_poses({key: left.without(mask) for key, left in self.state.poses.items()})
+        poses = {key: left.without(mask) for key, left in self.state.poses.items()}
+        self.state = self.state.replace(time=torch.where(mask, 0.0, self.time)).with_poses(poses)
         if self.state.impulse is not None:
             self.state = self.state.replace(impulse=self.state.impulse.masked_fill(mask[:, None, None], 0.0))
         if self._before is not None:
@@ -308,8 +322,8 @@ class Environments:
         from ..state.state_file import save
 
         if k is None:
-            clocks = {"time": self.time, EXTRA + FROZEN: self.frozen.int().repeat_interleave(self.room)}
-            tensors, record = tensors_of(self.state) | clocks, {"time": 0.0}
+            frozen = {EXTRA + FROZEN: self.frozen.int().repeat_interleave(self.room)}
+            tensors, record = tensors_of(self.state) | frozen, {"time": 0.0}
         else:
             one = self.scene(k)
             tensors, record = tensors_of(one), {"time": float(one.time)}
@@ -343,8 +357,8 @@ class Environments:
         if time.shape != self.time.shape or not bool((scene.eq(own) | scene.eq(ABSENT)).all()):
             raise ValueError(f"{path} must hold {len(self)} scenes of {self.room} particles, got others")
         _pairs(self.state, state)
-        self.time, self.frozen, self._froze = time, self._rows(frozen)[:, 0] != 0, True
-        self.state, self._before = state.replace(time=0.0), None
+        self.frozen, self._froze = self._rows(frozen)[:, 0] != 0, True
+        self.state, self._before = state.replace(time=time), None
         self.step.forget_failures(torch.ones_like(self.frozen))
 
 

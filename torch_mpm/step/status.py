@@ -101,9 +101,14 @@ class ErrorStatus:
         latest = [] if self.status is None else [self.status]
         return latest + [kept for kept in self._replayed if kept is not self.status]
 
-    def problems(self, grid: Grid) -> dict[str, Problem]:
-        """Problems of scenes in these steps, without synchronisation."""
-        problems = problems_of_status(self.all(), grid)
+    def problems(self, grid: Grid, state: State | None = None) -> dict[str, Problem]:
+        """Problems of scenes in these steps, and of positions of a state that the next step would find; without
+        synchronisation.
+        """
+        statuses = self.all()
+        if state is not None:
+            statuses.append(grid.status_at(state.x, state.scene, self.status_for(state.x), state.ids))
+        problems = problems_of_status(statuses, grid)
         if self.refused is not None:
             problems["dt"] = refused_steps(self.refused)
         if self.contradicted is not None:

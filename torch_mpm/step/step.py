@@ -531,16 +531,17 @@ class Step(TensorModule):
         `failed = step.failures().failed[state.scene.long()]; v = torch.where(failed[:, None], 0, state.v)`.
 
         Args:
-            state: its masses, volumes, velocities and deformations are checked too.
+            state: its positions, masses, volumes, velocities and deformations are checked too.
         """
-        problems = self._error_status.problems(self.grid)
+        state = None if state is None else self.prepare(state)
+        problems = self._error_status.problems(self.grid, state)
         if self.heat is not None:
             problems |= self.heat.problems()
         if self.integrator is not None:
             problems |= self.integrator.problems()
         if state is not None:
             taken = self.status is not None
-            problems |= problems_of_state(self.law, self.prepare(state), self.grid.scenes, taken)
+            problems |= problems_of_state(self.law, state, self.grid.scenes, taken)
         return Failures.of(problems, self.grid.scenes, self._error_status.given)
 
     def check(self, state: State | None = None) -> None:
@@ -557,9 +558,9 @@ class Step(TensorModule):
         Raises:
             SimulationError: that names each scene (up to a dozen of a kind), when and how many, and has `failures`: if
                 a particle left the grid or is not finite, if heat was not solved, if an entry of a tensor dt was
-                negative or NaN; and in the state, if a mass or volume is not positive and finite, or if the law
-                has no meaning for a particle's deformation (turned inside out, J ≤ 0); such a particle has zero stress
-                from then on.
+                negative or NaN; and in the state, if a position is outside the grid or not finite, if a mass or volume
+                is not positive and finite, or if the law has no meaning for a particle's deformation (turned inside
+                out, J ≤ 0); such a particle has zero stress from then on.
             GridOverflowError: if more blocks were active than the grid has room for, and nothing else is wrong.
         """
         raise_failures(self.failures(state), self._error_status.all(), self.grid)
