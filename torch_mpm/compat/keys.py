@@ -32,6 +32,21 @@ def check_keys(
         raise ValueError(f"{what} must have known keys: {'; '.join(problems)}")
 
 
+def checked_list(name: str, given: Any) -> list[Any]:
+    """A list of mappings.
+
+    Raises:
+        TypeError: for anything else.
+    """
+    if isinstance(given, (str, Mapping)) or not isinstance(given, Iterable):
+        raise TypeError(f"{name} must be a list of mappings, got {type(given).__name__}")
+    entries = list(given)
+    for k, entry in enumerate(entries):
+        if not isinstance(entry, Mapping):
+            raise TypeError(f"{name}[{k}] must be a mapping, got {type(entry).__name__}")
+    return entries
+
+
 def check_needed(what: str, given: Mapping[str, Any], needed: Iterable[str]) -> None:
     """Check that no key is missing.
 

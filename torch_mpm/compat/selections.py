@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..state.state import State
 from ..step.particle_operations import Timed
-from .gradients import Numbers
+from .gradients import Numbers, number
 
 
 class Rotation(Timed):
@@ -36,6 +36,9 @@ class Rotation(Timed):
         self.point, self.normal = (small_vector(v, particles.device) for v in (point, normal))
         if not 0 < float(self.normal.detach().norm()) < math.inf:
             raise ValueError(f"normal must have a positive length, got {self.normal.tolist()}")
+        for name, value in (("rotation_scale", rotation), ("translation_scale", translation)):
+            if not isinstance(value, Tensor):
+                number(name, value)
         self.rotation, self.translation = rotation, translation
 
     def forward(self, state: State, dt: float | Tensor) -> State:

@@ -13,8 +13,8 @@ from ...boundaries import Plane
 from ...laws.parameters import TensorModule
 from ...state.state import State
 from ...step.particle_operations import Hold, Push, Timed
-from ..gradients import Numbers, refuse_grad, vector
-from ..keys import check_keys
+from ..gradients import Numbers, check_fixed, vector
+from ..keys import check_keys, checked_list
 from ..node_conditions import stopping_plane, surface_margin
 from ..selections import Rotation, in_box, in_cylinder
 from .mpm_solver import RESET_STEPS, MPMSolver
@@ -32,7 +32,7 @@ def set_boundary_conditions(model: MPMSolver, bc_params: Iterable[Mapping[str, A
         TypeError: for an unknown type, or a missing argument.
         ValueError: for an unknown key, or a gradient that an argument cannot have.
     """
-    for condition in bc_params or ():
+    for condition in checked_list("bc_params", bc_params or ()):
         given = dict(condition)
         kind = given.pop("type", None)
         if kind not in CONDITIONS:
@@ -59,7 +59,7 @@ def set_velocity_on_cuboid(
 
     With `reset` they are at rest before, and for 15 steps after that.
     """
-    refuse_grad("it selects nodes", point=point, size=size, start_time=start_time, end_time=end_time)
+    check_fixed("it selects nodes", point=point, size=size, start_time=start_time, end_time=end_time)
     velocity = vector("velocity", velocity, model.init_pos)
     model.post_grid_process.append(NodeVelocity(point, size, velocity, start_time, end_time, reset))
 
@@ -79,8 +79,8 @@ def add_surface_collider(
     """
     if surface not in ("sticky", "slip", "collide"):
         raise TypeError(f"surface must be 'sticky', 'slip' or 'collide', got {surface!r}")
-    refuse_grad("it selects nodes", point=point, normal=normal, start_time=start_time, end_time=end_time)
-    refuse_grad("it has no effect", friction=friction)
+    check_fixed("it selects nodes", point=point, normal=normal, start_time=start_time, end_time=end_time)
+    check_fixed("it has no effect", friction=friction)
     margin = surface_margin(model.init_pos.dtype, 1.0)
     kind = "sticky" if surface == "sticky" else "slip"
     plane = stopping_plane(point, normal, margin, start_time, end_time, kind)
@@ -95,7 +95,7 @@ def add_sdf_collider(
     """
     if dim not in (0, 1, 2):
         raise ValueError(f"dim must be 0, 1 or 2, got {dim}")
-    refuse_grad("it is a number of the condition", bound=bound, start_time=start_time, end_time=end_time)
+    check_fixed("it is a number of the condition", bound=bound, start_time=start_time, end_time=end_time)
     model.pre_particle_process.append(Projection(model, bound, dim, start_time, end_time))
 
 
@@ -109,7 +109,7 @@ def add_impulse_on_particles(
     start_time: float = 0.0,
 ) -> None:
     """A force [N] on each particle that starts in a box of half edges `size`, for num_dt steps."""
-    refuse_grad("it selects particles", dt=dt, point=point, size=size, num_dt=num_dt, start_time=start_time)
+    check_fixed("it selects particles", dt=dt, point=point, size=size, num_dt=num_dt, start_time=start_time)
     inside = in_box(model.init_pos, point, size)
     given, share = vector("force", force, model.init_pos), dt / model.dt  # v changes by `dt` of the argument.
     scaled = given * share if isinstance(given, Tensor) else [f * share for f in given]
@@ -120,7 +120,7 @@ def enforce_particle_velocity_translation(
     model: MPMSolver, point: Numbers, size: Numbers, velocity: Numbers, start_time: float, end_time: float
 ) -> None:
     """Velocity of the particles that start in a box of half edges `size`."""
-    refuse_grad("it selects particles", point=point, size=size, start_time=start_time, end_time=end_time)
+    check_fixed("it selects particles", point=point, size=size, start_time=start_time, end_time=end_time)
     inside = in_box(model.init_pos, point, size)
     moving = vector("velocity", velocity, model.init_pos)
     model.pre_particle_process.append(Hold(moving, start_time, end_time, inside))
@@ -140,7 +140,7 @@ def enforce_particle_velocity_rotation(
     them along it at translation_scale [m/s]. (The original function of MPM-PyTorch raises an error when it is called.)
     """
     selecting = {"half_height_and_radius": half_height_and_radius, "start_time": start_time, "end_time": end_time}
-    refuse_grad("it selects particles", **selecting)
+    check_fixed("it selects particles", **selecting)
     point, normal = vector("point", point, model.init_pos), vector("normal", normal, model.init_pos)
     inside = in_cylinder(model.init_pos, point, normal, half_height_and_radius)
     turning = Rotation(point, normal, rotation_scale, translation_scale, start_time, end_time, inside)

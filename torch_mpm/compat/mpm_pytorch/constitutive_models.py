@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from .. import constitutive
-from ..gradients import refuse_grad
+from ..gradients import number, refuse_grad
 
 __all__ = [
     "CorotatedElasticity",
@@ -39,8 +39,8 @@ class _Model(nn.Module):
         for name, value in {"nu": nu, **others}.items():
             refuse_grad(f"a model copies its arguments; assign model.{name}", **{name: value})
         for name, value in {"nu": nu, **others}.items():
-            self.register_buffer(name, torch.tensor([float(value)]))
-        self.register_buffer("log_E", torch.tensor([float(E)]).log())
+            self.register_buffer(name, torch.tensor([number(name, value)]))
+        self.register_buffer("log_E", torch.tensor([number("E", E)]).log())
 
     def moduli(self, log_E: Tensor | None, nu: Tensor | None) -> tuple[Tensor, Tensor]:
         """μ and λ [Pa], [1] or [P]."""

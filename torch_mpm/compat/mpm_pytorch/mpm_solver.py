@@ -14,7 +14,7 @@ from ...grid.grid import Grid
 from ...step.particle_operations import Operations
 from ...step.step import Step
 from ..given_stress import GivenStress, clamped, stepped
-from ..gradients import Numbers, refuse_grad, vector
+from ..gradients import Numbers, check_fixed, refuse_grad, vector
 from ..node_conditions import NodeDamping
 from .call_times import CallTimes, is_recomputed
 
@@ -69,7 +69,12 @@ class MPMSolver:
     ) -> None:
         if not isinstance(init_pos, Tensor) or init_pos.dim() != 2 or init_pos.shape[1] != 3:
             raise ValueError(f"init_pos must have shape [P, 3], got {shape_of(init_pos)}")
-        refuse_grad("it is a number of the solver", center=center, size=size)
+        refuse_grad("it is a number of the solver", center=center)
+        check_fixed("it is a number of the solver", size=size)
+        if not isinstance(rho, Tensor):
+            check_number("rho", rho, "positive and finite", lambda v: 0 < v < math.inf)
+        elif tuple(rho.shape) not in ((), (1,), (len(init_pos),)):
+            raise ValueError(f"rho must be a number, or have shape [] or [P] = [{len(init_pos)}], got {shape_of(rho)}")
         self.init_pos = init_pos.detach().to(device=device)
         self.device = self.init_pos.device
         self.n_particles = len(init_pos)

@@ -15,8 +15,14 @@ from torch import Tensor, nn
 
 from ...ops.svd import polar, svd3
 from .. import constitutive
+from ..gradients import number
 from ..settings import setting
 from .warp import SVD
+
+
+def _single(cfg: Any, name: str) -> Tensor:
+    """A number of a configuration [1]."""
+    return torch.tensor([number(name, setting(cfg, name))])
 
 
 class Material(nn.Module):
@@ -80,8 +86,8 @@ class _Moduli(Material):
 
     def __init__(self, cfg: Any) -> None:
         super().__init__(cfg)
-        self.log_E = nn.Parameter(self._started(torch.tensor([float(setting(cfg, "E"))]).log(), cfg))
-        self.register_buffer("nu", torch.tensor([float(setting(cfg, "nu"))]))
+        self.log_E = nn.Parameter(self._started(_single(cfg, "E").log(), cfg))
+        self.register_buffer("nu", _single(cfg, "nu"))
 
     @staticmethod
     def _started(value: Tensor, cfg: Any) -> Tensor:
@@ -146,7 +152,7 @@ class VonMisesPlasticity(_Moduli, Plasticity):
 
     def __init__(self, cfg: Any) -> None:
         super().__init__(cfg)
-        self.sigma_y = nn.Parameter(self._started(torch.tensor([float(setting(cfg, "sigma_y"))]), cfg))
+        self.sigma_y = nn.Parameter(self._started(_single(cfg, "sigma_y"), cfg))
 
     def forward(self, F: Tensor) -> Tensor:
         return constitutive.von_mises(F, self.moduli()[0], self.sigma_y)
@@ -159,8 +165,8 @@ class DruckerPragerPlasticity(_Moduli, Plasticity):
 
     def __init__(self, cfg: Any) -> None:
         super().__init__(cfg)
-        self.friction_angle = nn.Parameter(self._started(torch.tensor([float(setting(cfg, "friction_angle"))]), cfg))
-        self.register_buffer("cohesion", torch.tensor([float(setting(cfg, "cohesion"))]))
+        self.friction_angle = nn.Parameter(self._started(_single(cfg, "friction_angle"), cfg))
+        self.register_buffer("cohesion", _single(cfg, "cohesion"))
 
     def forward(self, F: Tensor) -> Tensor:
         return constitutive.drucker_prager(F, *self.moduli(), self.friction_angle, self.cohesion)
@@ -292,7 +298,7 @@ class _NetworkPlasticity(_Network, Plasticity):
 
     def __init__(self, cfg: Any) -> None:
         super().__init__(cfg)
-        self.alpha = float(setting(cfg, "alpha"))
+        self.alpha = number("alpha", setting(cfg, "alpha"))
 
     def forward(self, F: Tensor) -> Tensor:
         return F + self.alpha * self.output(F)

@@ -15,7 +15,7 @@ from ...laws.parameters import TensorModule
 from ...state.state import State
 from ...step.step import Step
 from ..given_stress import GivenStress, clamped, stepped
-from ..gradients import Numbers, refuse_grad, vector
+from ..gradients import Numbers, check_fixed, refuse_grad, vector
 from ..settings import setting
 from .particles import MPMInitData, MPMState, MPMStateInitializer, MPMStatics, MPMStaticsInitializer
 
@@ -60,7 +60,7 @@ class MPMModel:
         self.num_grids = check_count("num_grids", num_grids, 1)
         self.dt = float(check_number("dt", dt, "positive and finite", lambda v: 0 < v < math.inf))
         self.bound, self.dx, self.device = check_count("bound", bound), 1 / num_grids, device
-        refuse_grad("it is a number of the model", eps=eps)
+        check_fixed("it is a number of the model", eps=eps)
         self.gravity, self.eps = vector("gravity", gravity, torch.empty(0, device=device)), float(eps)
         lower, upper = (bound - 1) * self.dx, (num_grids - bound + 1) * self.dx
         step = Step(Grid(self.dx, (0.0,) * 3, (1.0,) * 3), GivenStress(), on_particles=self._present)

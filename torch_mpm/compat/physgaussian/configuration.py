@@ -8,8 +8,9 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from ...errors import check_number
 from ...files import read_text
-from ..keys import check_keys, check_needed
+from ..keys import check_keys, check_needed, checked_list
 from .parameters import BOX, BOX_UNSUPPORTED, UNSUPPORTED
 from .simulator import MPM_Simulator_WARP
 
@@ -96,20 +97,22 @@ def decode_param_json(
             [0, 0.5], or a box of material parameters that lacks one.
     """
     given = json.loads(read_text(json_file, "configuration"))
+    if not isinstance(given, Mapping):
+        raise TypeError(f"the configuration must be a mapping, got {type(given).__name__}")
     _check_configuration(given)
 
     def part(defaults: Mapping[str, Any]) -> dict[str, Any]:
         return {name: given.get(name, value) for name, value in defaults.items()}
 
     material = part(MATERIAL) | {name: given[name] for name in MATERIAL_OPTIONS if name in given}
-    if not 0 <= material["nu"] <= 0.5:
-        raise ValueError(f"nu must be between 0 and 0.5, got {material['nu']}")
-    for box in material.get("additional_material_params", []):
+    check_number("nu", material["nu"], "between 0 and 0.5", lambda v: 0 <= v <= 0.5)
+    for box in checked_list("additional_material_params", material.get("additional_material_params", [])):
         check_keys(A_BOX, box, BOX, BOX_UNSUPPORTED)
         check_needed(A_BOX, box, ("point", "size", "E", "nu"))
         box.setdefault("density", material["density"])
     preprocessing = part(PREPROCESSING)
     if preprocessing["particle_filling"] is not None:
+        checked_list("particle_filling", [preprocessing["particle_filling"]])
         filling = {"n_grid": 4 * material["n_grid"], **FILLING}
         check_keys("particle_filling", preprocessing["particle_filling"], filling)
         preprocessing["particle_filling"] = filling | preprocessing["particle_filling"]
@@ -125,7 +128,7 @@ def set_boundary_conditions(
         TypeError: for an unknown type.
         ValueError: for a missing or unknown key, or a type of a descendant.
     """
-    for condition in bc_params:
+    for condition in checked_list("boundary_conditions", bc_params):
         check_needed("a boundary condition", condition, ("type",))
         kind = condition["type"]
         if kind in OTHER_CONDITIONS:

@@ -93,7 +93,11 @@ def _in_range(name: str, value: Any, like: Tensor) -> float | Tensor:
     expected, holds = RANGES[name]
     if not isinstance(value, Tensor) and not hasattr(value, "__len__"):
         return float(check_number(name, value, expected, lambda v: math.isfinite(v) and bool(holds(v))))
-    tensor = torch.as_tensor(value, dtype=like.dtype, device=like.device)
+    try:
+        tensor = torch.as_tensor(value, dtype=like.dtype, device=like.device)
+    except (TypeError, ValueError, RuntimeError):
+        found = repr(value) if isinstance(value, str) else shape_of(value)
+        raise TypeError(f"{name} must be a number, or numbers [P], got {found}") from None
     one = name in OF_THE_WHOLE
     if tuple(tensor.shape) not in (((), (1,)) if one else ((), (1,), (len(like),))):
         shapes = "[]" if one else f"[] or [P] = [{len(like)}]"

@@ -18,8 +18,8 @@ from ...rollouts import rollout
 from ...state.state import State, identity_deformation
 from ...step.particle_operations import Hold, Operations, Push, Timed
 from ...step.step import Step
-from ..gradients import Numbers, refuse_grad, vector
-from ..keys import check_keys, check_needed
+from ..gradients import Numbers, check_fixed, vector
+from ..keys import check_keys, check_needed, checked_list
 from ..node_conditions import FreezeOutside, NodeDamping, moving_cuboid, outer_planes, stopping_plane, surface_margin
 from ..selections import Rotation, in_box, in_cylinder
 from .exchange import Exchange
@@ -144,7 +144,7 @@ class MPM_Simulator_WARP(Exchange):
         given = dict(kwargs or {})
         state = self._flushed()
         check_keys("set_parameters_dict", given, (*KNOWN, *WITHOUT_EFFECT), UNSUPPORTED)
-        extra = given.pop("additional_material_params", [])
+        extra = checked_list("additional_material_params", given.pop("additional_material_params", []))
         self.parameters |= {name: checked(name, value, state.x) for name, value in given.items()}
         for box in extra:
             self._set_in_box(state, box)
@@ -162,7 +162,7 @@ class MPM_Simulator_WARP(Exchange):
         what = "a box of additional_material_params"
         check_keys(what, box, BOX, BOX_UNSUPPORTED)
         check_needed(what, box, BOX)
-        refuse_grad("it selects particles", point=box["point"], size=box["size"])
+        check_fixed("it selects particles", point=box["point"], size=box["size"])
         inside = in_box(state.x, box["point"], box["size"])
         for name in ("E", "nu", "density"):
             value = torch.as_tensor(checked(name, box[name], state.x), dtype=state.x.dtype, device=state.x.device)
@@ -207,8 +207,8 @@ class MPM_Simulator_WARP(Exchange):
         A surface that slips, separates or has friction is `add_boundary(torch_mpm.Plane(...))`. "cut" is specific to
         that simulator, with fixed heights.
         """
-        refuse_grad("it selects nodes", point=point, normal=normal, start_time=start_time, end_time=end_time)
-        refuse_grad("it has no effect", friction=friction)
+        check_fixed("it selects nodes", point=point, normal=normal, start_time=start_time, end_time=end_time)
+        check_fixed("it has no effect", friction=friction)
         if surface == "sticky" and friction != 0:
             raise ValueError(f"friction must be 0 on sticky surfaces, got {friction}")
         if surface == "cut":
@@ -235,7 +235,7 @@ class MPM_Simulator_WARP(Exchange):
 
         With `reset` 1 all nodes of the grid are at rest before `start_time`, and for 15 steps after `end_time`.
         """
-        refuse_grad("it selects nodes", point=point, size=size, start_time=start_time, end_time=end_time)
+        check_fixed("it selects nodes", point=point, size=size, start_time=start_time, end_time=end_time)
         moving = vector("velocity", velocity, self._flushed().x)
         self.add_boundary(moving_cuboid(point, size, moving, self._margin, start_time, end_time))
         if reset == 1:
@@ -243,7 +243,7 @@ class MPM_Simulator_WARP(Exchange):
 
     def add_bounding_box(self, start_time: float = 0.0, end_time: float = FOREVER) -> None:
         """Close the domain: no node within 3 of a face moves outwards."""
-        refuse_grad("it selects nodes", start_time=start_time, end_time=end_time)
+        check_fixed("it selects nodes", start_time=start_time, end_time=end_time)
         n, dx = self.parameters["n_grid"], self._dx
         for plane in outer_planes((PADDING - 1) * dx, (n - PADDING) * dx, 3, start_time, end_time):
             self.add_boundary(plane)
@@ -264,7 +264,7 @@ class MPM_Simulator_WARP(Exchange):
         device: torch.device | str | None = None,
     ) -> None:
         """A force [N] on each particle that is now in a box of half edges `size`, for num_dt steps of dt."""
-        refuse_grad("it selects particles", dt=dt, point=point, size=size, num_dt=num_dt, start_time=start_time)
+        check_fixed("it selects particles", dt=dt, point=point, size=size, num_dt=num_dt, start_time=start_time)
         x = self._flushed().x
         inside = in_box(x, point, size)
         self._pushes.append(Push(vector("force", force, x), start_time, start_time + dt * num_dt, inside))
@@ -280,7 +280,7 @@ class MPM_Simulator_WARP(Exchange):
         device: torch.device | str | None = None,
     ) -> None:
         """Velocity of the particles that are now in a box of half edges `size`."""
-        refuse_grad("it selects particles", point=point, size=size, start_time=start_time, end_time=end_time)
+        check_fixed("it selects particles", point=point, size=size, start_time=start_time, end_time=end_time)
         x = self._flushed().x
         self._hold(Hold(vector("velocity", velocity, x), start_time, end_time, in_box(x, point, size)))
 
@@ -299,7 +299,7 @@ class MPM_Simulator_WARP(Exchange):
         and move them along it at translation_scale [m/s].
         """
         selecting = {"half_height_and_radius": half_height_and_radius, "start_time": start_time, "end_time": end_time}
-        refuse_grad("it selects particles", **selecting)
+        check_fixed("it selects particles", **selecting)
         x = self._flushed().x
         point, normal = vector("point", point, x), vector("normal", normal, x)
         inside = in_cylinder(x, point, normal, half_height_and_radius)
@@ -318,7 +318,7 @@ class MPM_Simulator_WARP(Exchange):
         `end_position` last. There are 50 layers, for any num_layers, as in the original simulator.
         """
         times = {"start_time": start_time, "end_time": end_time, "num_layers": num_layers}
-        refuse_grad(
+        check_fixed(
             "it selects particles", normal=normal, start_position=start_position, end_position=end_position, **times
         )
         x = self._flushed().x
