@@ -429,7 +429,7 @@ def test_ops_read_no_further_than_their_parameters(law: str, device: str) -> Non
     F = torch.eye(dim, dtype=torch.float64, device=device).repeat(P, 1, 1) * 1.01
     state = F if info.field == "F" else F[:, 0, 0].contiguous()
     scene = torch.arange(P, dtype=torch.int32, device=device) % B
-    history = [0.1 * (F if h.matrix else F[:, 0, 0]) for h in info.history]
+    history = [0.1 * (F if h.matrix else F[:, 0, 0]) for h in info.history_with(())]
     for k, _ in enumerate(info.parameters):
 
         def energy(entries: int, k: int = k) -> Tensor:

@@ -369,11 +369,7 @@ def test_reasons_to_step_from_python(device):
         "FLIP keeps a share of the impulses on mirrors": (bouncing, bouncing.with_impulses(state), 1e-4),
         "on_grid": (mpm.Step(unit_box(), law, on_grid=lambda b, v, m, dt: v), state, 1e-4),
         "CustomLaw": (mpm.Step(unit_box(), lambda F: F), state, 1e-4),
-        "QuarticSand": (
-            mpm.Step(unit_box(), mpm.QuarticSand(E=1e4, nu=0.3, hardening=(0.6, 0.1, 0.2, 0.1))),
-            state,
-            1e-4,
-        ),
+        "ThermalExpansion": (mpm.Step(unit_box(), mpm.ThermalExpansion(law, 1e-3)), state, 1e-4),
         "the time of the state requires a gradient": (
             mpm.Step(unit_box(), law, boundaries=[mpm.Sphere((0.5,) * 3, 0.1, end=1.0)]),
             state.replace(time=torch.zeros(1, dtype=F64, device=device, requires_grad=True)),

@@ -153,11 +153,11 @@ class _Calls:
                 continue
             shapes = itertools.islice(itertools.cycle(((2,), (P,), (), (1,))), len(info.parameters))
             p = [0.5 + self.uniform(*shape) for shape in shapes]
-            q = [0.5 + (self.uniform(P, D, D) if h.matrix else self.uniform(P)) for h in info.history]
+            q = [0.5 + (self.uniform(P, D, D) if h.matrix else self.uniform(P)) for h in info.history_with(())]
             state = self.F if info.field == "F" else 0.5 + self.uniform(P)
             C = self.normal(P, D, D) if info.viscous else None
             tail = (self.scene, law, D)
-            entries = sum(D * D if h.matrix else 1 for h in info.history)
+            entries = sum(D * D if h.matrix else 1 for h in info.history_with(()))
             grads = (
                 self.normal(P, D, D) if info.plastic else None,
                 *(self.normal(P, D, D), self.normal(P, entries) if q else None, self.normal(P), self.normal(P)),

@@ -236,6 +236,15 @@ MPM_HD Pack<T, N> fma(const Pack<T, N>& a, const Pack<T, N>& b, const Pack<T, N>
 }
 
 template <class T, int N>
+MPM_HD Pack<T, N> sin(const Pack<T, N>& a) {
+  return map(a, [](T x) { return mpm::sin(x); });
+}
+template <class T, int N>
+MPM_HD Pack<T, N> cos(const Pack<T, N>& a) {
+  return map(a, [](T x) { return mpm::cos(x); });
+}
+
+template <class T, int N>
 MPM_HD Pack<T, N> floor(const Pack<T, N>& a) {
   return map(a, [](T x) { return sizeof(T) == 4 ? T(__builtin_floorf(x)) : T(__builtin_floor(x)); });
 }

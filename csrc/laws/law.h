@@ -33,7 +33,8 @@ struct Quantity {
   const char* unit;
   double low = -INFINITY, high = INFINITY;
   bool with_low = true, with_high = true;
-  bool matrix = false;  // history only: D by D entries
+  bool matrix = false;           // history only: D by D entries
+  const char* option = nullptr;  // history only: the option without which a law does not have it
 };
 
 constexpr Quantity real(const char* name, const char* unit) { return {name, unit}; }
@@ -42,6 +43,11 @@ constexpr Quantity positive(const char* name, const char* unit) { return {name, 
 
 constexpr Quantity matrix(const char* name, const char* unit) {
   return {name, unit, -INFINITY, INFINITY, true, true, true};
+}
+
+constexpr Quantity with_option(const char* option, Quantity q) {
+  q.option = option;
+  return q;
 }
 
 // Time step [s] of a rate-dependent law: the last of its parameters.

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <cstring>
 #include <string>
 
 #include "common/backend.h"
@@ -84,10 +85,29 @@ inline void check_state(const LawInfo& law, const Tensor& state, int64_t dim) {
   check_count(state.size(0), "the state", "particles");
 }
 
-inline void check_number(const Tensors& given, const char* name, size_t expected, const LawInfo& law,
-                         bool optional = false) {
-  STD_TORCH_CHECK(given.size() == expected || (optional && given.empty()), name, " must be ", expected,
+inline void check_parameter_count(const Tensors& given, const LawInfo& law) {
+  STD_TORCH_CHECK(given.size() == law.parameters.size(), "parameters must be ", law.parameters.size(),
                   " tensors for the law ", law.name, ", got ", given.size());
+}
+
+// The history that a law has with the given options, in its order.
+inline std::vector<Quantity> history_with(const LawInfo& law, int64_t options) {
+  std::vector<Quantity> variables;
+  for (const Quantity& q : law.history) {
+    bool present = q.option == nullptr;
+    for (size_t k = 0; k < law.options.size() && !present; k++)
+      present = (options >> k & 1) && std::strcmp(law.options[k], q.option) == 0;
+    if (present) variables.push_back(q);
+  }
+  return variables;
+}
+
+// A law with optional history works with the first variables alone. Negative options are those of an op without any.
+inline void check_history_count(const Tensors& given, const LawInfo& law, int64_t options) {
+  const size_t most = options < 0 ? law.history.size() : history_with(law, options).size();
+  STD_TORCH_CHECK(law.optional_history ? given.size() <= most : given.size() == most, "history must be ",
+                  law.optional_history ? "at most " : "", most, " tensors for the law ", law.name,
+                  options < 0 ? "" : " with these options", ", got ", given.size());
 }
 
 // Entries of all given history variables of a particle.
@@ -108,11 +128,11 @@ void limit_scenes(LawArguments<T, D>& a, size_t count) {
     if (Parameter<T>& modulus = a.parameters[k]; modulus.stride == 0 || modulus.scenes) modulus.scenes = entries;
 }
 
-// `scenes` is the number of scenes of the batch, or -1 if the call does not have it.
+// `options` and `scenes`, the number of scenes of the batch, are -1 if the call does not have them.
 template <class T, int D>
 LawArguments<T, D> arguments(const LawInfo& law, const Tensor& state, const OptionalTensor& C,
                              const Tensors& parameters, const Tensors& history, const OptionalTensor& scene,
-                             int64_t options = 0, int64_t scenes = -1) {
+                             int64_t options = -1, int64_t scenes = -1) {
   const int64_t P = state.size(0);
   LawArguments<T, D> a;
   a.particles = P;
@@ -120,11 +140,11 @@ LawArguments<T, D> arguments(const LawInfo& law, const Tensor& state, const Opti
   STD_TORCH_CHECK(law.viscous || !has(C), "a law without viscosity takes no C");
   a.C = input<T>(C, "C", state, {P, D, D});
   set_scene(a, scene, state);
-  STD_TORCH_CHECK(options >= 0 && options < int64_t(1) << law.options.size(), "options must be bits of the ",
+  STD_TORCH_CHECK(options >= -1 && options < int64_t(1) << law.options.size(), "options must be bits of the ",
                   law.options.size(), " options of the law ", law.name, ", got ", options);
-  a.options = int(options);
-  check_number(parameters, "parameters", law.parameters.size(), law);
-  check_number(history, "history", law.history.size(), law, law.optional_history);
+  a.options = options < 0 ? 0 : int(options);
+  check_parameter_count(parameters, law);
+  check_history_count(history, law, options);
   ParameterScenes of_parameters(scene, scenes);
   for (size_t k = 0; k < parameters.size(); k++)
     a.parameters[k] = parameter<T>(parameters[k], element("parameters", int(k)), state, P, of_parameters);

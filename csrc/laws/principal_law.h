@@ -453,7 +453,9 @@ struct PrincipalKernels {
     const Matrix<V, D> by_F = energy_adjoint<Law>(
         s, data, grad, a.parameters.pointer != nullptr, a.history.pointer != nullptr,
         [&](int k, const V& value) { store_entry(at, a.parameters, k, select(valid, value, V(0))); },
-        [&](int k, const V& value) { store_entry(at, a.history, k, select(valid, value, V(0))); });
+        [&](int k, const V& value) {  // a law may go without some of its history
+          if (a.law.history[k].pointer) store_entry(at, a.history, k, select(valid, value, V(0)));
+        });
     if (a.state.pointer) store_matrix<D>(at, a.state, select(valid, by_F, zero_matrix<V, D>()));
   }
 

@@ -43,7 +43,8 @@ std::string json_list(const List& list, F&& element) {
 std::string quantity_as_json(const Quantity& q) {
   return std::string("{\"name\": \"") + q.name + "\", \"unit\": \"" + q.unit + "\", \"low\": " + number(q.low) +
          ", \"high\": " + number(q.high) + ", \"with_low\": " + flag(q.with_low) +
-         ", \"with_high\": " + flag(q.with_high) + ", \"matrix\": " + flag(q.matrix) + "}";
+         ", \"with_high\": " + flag(q.with_high) + ", \"matrix\": " + flag(q.matrix) +
+         ", \"option\": " + (q.option ? std::string("\"") + q.option + "\"" : "null") + "}";
 }
 
 std::string law_as_json(const LawInfo& info) {

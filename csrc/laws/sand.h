@@ -8,26 +8,35 @@
 // With a volume correction (Tampubolon et al. 2017) sand at the apex is torn: it loses all strain, cohesion included,
 // and stores the logarithm v_c of the volume. Until compression has closed that gap it has no stress and no cohesion:
 // the map uses the trial strain h + v_c/D, and sand is at the apex while tr h + v_c ≥ 0.
+//
+// With hardening (Klár et al. 2016, equations 29 and 30) the friction angle is φ + (h1 q − h3) exp(−h2 q), where φ is
+// the angle of the given slope and q the sum of the plastic multipliers of all steps before.
 namespace mpm {
 inline namespace TORCH_MPM_ISA {
 
 template <class Law>
 struct SandKernels;
 
-enum SandOption : int { kKeepApex = 1, kElasticOnly = 2 };
+enum SandOption : int { kKeepApex = 1, kElasticOnly = 2, kHardens = 4 };
 
 // A law of sand with an energy of laws/quartic_energy.h, or ExactFlow of one.
 template <class Energy_>
 struct Sand : PrincipalLaw {
   using Energy = Energy_;
-  static constexpr std::array parameters = {not_negative("mu", "Pa"), real("lam", "Pa"),
-                                            not_negative("friction_slope", ""), not_negative("cohesion", ""),
-                                            not_negative("smallest_strain", "")};
-  static constexpr std::array history = {real("volume_correction", "")};
+  static constexpr std::array parameters = {not_negative("mu", "Pa"),
+                                            real("lam", "Pa"),
+                                            not_negative("friction_slope", ""),
+                                            not_negative("cohesion", ""),
+                                            not_negative("smallest_strain", ""),
+                                            not_negative("h1", ""),
+                                            not_negative("h2", ""),
+                                            real("h3", "")};
+  static constexpr std::array history = {with_option("hardens", not_negative("hardening", "")),
+                                         real("volume_correction", "")};
   static constexpr bool plastic = true, optional_history = true, in_2d = !Energy::exact_flow;
   static constexpr bool twice_differentiable_energy = true;
-  // keep_apex: see return_map; elastic: F is unchanged.
-  static constexpr std::array options = {"keep_apex", "elastic"};
+  // keep_apex: see return_map; elastic: F is unchanged; hardens: h1 to h3 and the first history variable are read.
+  static constexpr std::array options = {"keep_apex", "elastic", "hardens"};
   // Those of the update affect only the exact flow, whose rare roots in float64 would need as many registers; the
   // backward would lose a third of its time with 190.
   static constexpr int gpu_update_blocks = 5, gpu_backward_blocks = 4;
@@ -50,10 +59,35 @@ struct Sand : PrincipalLaw {
   }
 };
 
+constexpr double kRootOfTwoThirds = 0.81649658092772603;
+
+// Slope of a cone by the sine of its friction angle (`friction_alpha` of torch_mpm/ops/sand.py), and the inverse.
+template <int D, class T>
+MPM_HD T slope_of_sine(const T& sine) {
+  return D == 2 ? T(M_SQRT1_2) * sine : T(2 * kRootOfTwoThirds) * sine / (T(3) - sine);
+}
+template <int D, class T>
+MPM_HD T sine_of_slope(const T& slope) {
+  return D == 2 ? T(M_SQRT2) * slope : T(3) * slope / (T(2 * kRootOfTwoThirds) + slope);
+}
+
+// Parameters of the slope of a cone.
+enum SlopeParameter : int { kSlope, kH1, kH2, kH3, kHardening, kSlopeParameters };
+
+// The slope after hardening.
+template <int D, class T>
+MPM_HD T hardened_slope(const T (&p)[kSlopeParameters]) {
+  const T sine = sine_of_slope<D>(p[kSlope]), rest = T(1) - sine * sine;
+  const T cosine = sqrt(select(rest > T(0), rest, T(0)));
+  const T change = (p[kH1] * p[kHardening] - p[kH3]) * exponential(T(0) - p[kH2] * p[kHardening]);
+  return slope_of_sine<D>(sine * cos(change) + cosine * sin(change));
+}
+
 template <class T>
 struct SandParameters {
-  T mu, lam, alpha;
-  T cohesion, volume;  // the cohesion of torn sand is 0
+  T mu, lam;
+  T slope[kSlopeParameters];  // of the cone, before hardening
+  T cohesion, volume;         // the cohesion of torn sand is 0
   Cone<T> cone;
   MaskOf<T> shear, torn;  // μ > 0; v_c > 0 where the apex loses volume
 };
@@ -64,18 +98,41 @@ MPM_HD bool keeps_volume(const LawArguments<T, D>& a) {
   return Energy::unilateral_yield && (a.options & kKeepApex);
 }
 
+// The volume correction, and its place in the history.
+template <class T, int D>
+MPM_HD Field<const T> volume_correction(const LawArguments<T, D>& a) {
+  return a.options & kHardens ? a.history[1] : a.history[0];
+}
+template <class T, int D>
+MPM_HD int volume_place(const LawArguments<T, D>& a) {
+  return a.options & kHardens ? 1 : 0;
+}
+
+// Entry k of a field [P, n] as a scalar field.
+template <class T>
+MPM_HD Field<T> entry_of(Field<T> f, int k) {
+  if (f.pointer) f.pointer += k * f.stride[1];
+  return f;
+}
+
 template <class Energy, class V, class At, class T, int D>
 MPM_HD SandParameters<V> load_parameters(const At& at, const LawArguments<T, D>& a) {
   const auto load = [&](int k) { return convert<V>(load_parameter(at, a, k)); };
   SandParameters<V> r;
   r.mu = load(0);
   r.lam = load(1);
-  r.alpha = load(2);
-  r.volume = convert<V>(load_scalar_or_zero(at, a.history[0]));
+  r.slope[kSlope] = load(2);
+  V alpha = r.slope[kSlope];
+  if (a.options & kHardens) {
+    r.slope[kH1] = load(5), r.slope[kH2] = load(6), r.slope[kH3] = load(7);
+    r.slope[kHardening] = convert<V>(load_scalar_or_zero(at, a.history[0]));
+    alpha = hardened_slope<D>(r.slope);
+  }
+  r.volume = convert<V>(load_scalar_or_zero(at, volume_correction(a)));
   r.torn = (keeps_volume<Energy>(a) ? V(0) : r.volume) > V(0);
   r.cohesion = select(r.torn, V(0), load(3));
   r.shear = r.mu > V(0);
-  r.cone = {r.alpha, select(r.shear, r.lam / select(r.shear, r.mu, V(1)), V(0))};
+  r.cone = {alpha, select(r.shear, r.lam / select(r.shear, r.mu, V(1)), V(0))};
   return r;
 }
 
@@ -112,7 +169,7 @@ MPM_HD_LARGE SandState<V, D> sand_state(const HenckyStrain<V, D>& s, const SandP
   SandState<V, D> r;
   r.m =
       !(a.options & kElasticOnly) ? return_map<Energy, Rough>(trial, p.cone, p.shear, p.torn, keeps) : unmapped(trial);
-  r.tears = a.history[0].pointer && !keeps ? r.m.apex : never;
+  r.tears = volume_correction(a).pointer && !keeps ? r.m.apex : never;
   r.h = shifted(r.m.h, select(r.tears, V(0), p.cohesion));
   r.stress = sand_stress<Energy>(r.h, p.mu, p.lam);
   V finite = V(0);
@@ -200,21 +257,23 @@ MPM_HD void add_adjoint_of_dissipation(SandAdjoint<T, D>& r, const T& g, const H
   r.lam = r.lam + g * dissipated_energy<Energy>(d, state.h, T(0), T(1));
 }
 
-// Adjoints of the requested scalar results.
+// Adjoints of the requested scalar results. The multiplier is added to the hardening.
 template <class Energy, class At, class T, class V, int D>
 MPM_HD void add_adjoint_of_scalars(SandAdjoint<V, D>& r, const LawBackwardArguments<T, D>& a, const At& at,
                                    const HenckyStrain<V, D>& s, const SandState<V, D>& state,
                                    const SandParameters<V>& p) {
-  if (a.grad_multiplier.pointer) {
-    const V g = load_where<V>(at, a.grad_multiplier, state.moved);
+  const bool hardens = a.law.options & kHardens && a.grad_history.pointer;
+  if (a.grad_multiplier.pointer || hardens) {
+    V g = hardens ? load_where<V>(at, a.grad_history, state.moved) : V(0);
+    if (a.grad_multiplier.pointer) g = g + load_where<V>(at, a.grad_multiplier, state.moved);
     const Vector<V, D> along = g * plastic_increment(s.h, state.h).direction;
     r.trial = r.trial + along;
     r.mapped = r.mapped + V(-1) * along;
   }
   if (a.grad_dissipated.pointer)
     add_adjoint_of_dissipation<Energy>(r, load_where<V>(at, a.grad_dissipated, state.moved), s, state, p);
-  if (a.grad_history.pointer) {
-    r.volume = load_where<V>(at, a.grad_history, state.valid & state.tears);
+  if (a.grad_history.pointer && volume_correction(a.law).pointer) {
+    r.volume = load_where<V>(at, entry_of(a.grad_history, volume_place(a.law)), state.valid & state.tears);
     r.trial = shifted(r.trial, r.volume);
   }
 }
@@ -231,6 +290,30 @@ MPM_HD void pull_back(SandAdjoint<T, D>& r, const SandState<T, D>& state, const 
   r.volume = r.volume + T(1.0 / D) * through;
   r.cohesion = r.cohesion + select(state.tears, T(0), sum(r.mapped)) - through;
   r.cohesion = select(p.torn, T(0), r.cohesion);
+}
+
+// Through the slope after hardening: from its adjoint, the first entry, to those of its parameters.
+template <int D, class T>
+MPM_HD void add_adjoint_of_slope(const T (&p)[kSlopeParameters], T (&adjoint)[kSlopeParameters]) {
+  const T given = adjoint[kSlope];
+  for (int k = 0; k < kSlopeParameters; k++) {
+    Dual<T> along[kSlopeParameters];
+    for (int i = 0; i < kSlopeParameters; i++) along[i] = {p[i], T(i == k)};
+    adjoint[k] = given * hardened_slope<D>(along).derivative;
+  }
+}
+
+template <class V, class At, class T, int D>
+MPM_HD void store_adjoint_of_history(const LawBackwardArguments<T, D>& a, const At& at, const MaskOf<V>& valid,
+                                     const V& by_hardening, const V& by_volume) {
+  if (a.law.options & kHardens) {
+    const V same = load_scalar_or_zero(at, a.grad_history);
+    store_entry(at, a.history, 0, same + select(valid, by_hardening, V(0)));
+  }
+  if (!volume_correction(a.law).pointer) return;
+  const int place = volume_place(a.law);
+  const V same = load_scalar_or_zero(at, entry_of(a.grad_history, place));
+  store_entry(at, a.history, place, select(valid, by_volume, same));
 }
 
 template <class T, int D>
@@ -265,16 +348,20 @@ struct SandKernels : PrincipalKernels<Law> {
                        select(state.m.converged, V(0), V(kNotConverged));
       at.store_integer(a.branch, select(state.valid, branch, V(kInvalid)));
     }
-    if (a.multiplier.pointer)
-      at.store(a.multiplier.pointer, a.multiplier.stride[0],
-               select(state.moved, plastic_increment(s.h, state.h).norm, V(0)));
+    const bool hardens = a.law.options & kHardens && a.history.pointer;
+    if (a.multiplier.pointer || hardens) {
+      const V multiplier = select(state.moved, plastic_increment(s.h, state.h).norm, V(0));
+      if (a.multiplier.pointer) at.store(a.multiplier.pointer, a.multiplier.stride[0], multiplier);
+      if (hardens) store_entry(at, a.history, 0, p.slope[kHardening] + multiplier);
+    }
     if (a.dissipated.pointer) {
       const V lost = dissipated_energy<Energy>(dissipation<Energy>(s, state, p), state.h, p.mu, p.lam);
       at.store(a.dissipated.pointer, a.dissipated.stride[0], select(state.moved, lost, V(0)));
     }
     // Loss of the trace: on the cone and where the volume is preserved, none.
-    if (a.history.pointer)
-      store_entry(at, a.history, 0, select(state.valid, select(state.tears, p.volume + sum(s.h), V(0)), p.volume));
+    if (a.history.pointer && volume_correction(a.law).pointer)
+      store_entry(at, a.history, volume_place(a.law),
+                  select(state.valid, select(state.tears, p.volume + sum(s.h), V(0)), p.volume));
   }
 
   // The strains, their map and its adjoint in W, the axes in V: for float32 arguments in float64 and float32, because a
@@ -311,13 +398,14 @@ struct SandKernels : PrincipalKernels<Law> {
       const Matrix<V, D> grad = s.U * principal * transpose(right);
       store_matrix<D>(at, a.state, select(valid, grad, grad_F));
     }
+    W slope[kSlopeParameters] = {g.alpha, W(0), W(0), W(0), W(0)};
+    if (a.law.options & kHardens) add_adjoint_of_slope<D>(p.slope, slope);
     if (a.parameters.pointer) {
-      const W values[] = {g.mu, g.lam, g.alpha, g.cohesion, W(0)};
+      const W values[] = {g.mu, g.lam, slope[kSlope], g.cohesion, W(0), slope[kH1], slope[kH2], slope[kH3]};
       MPM_UNROLL for (int k = 0; k < kParameters<Law>; k++)
         store_entry(at, a.parameters, k, select(valid, convert<V>(values[k]), V(0)));
     }
-    if (a.history.pointer)
-      store_entry(at, a.history, 0, select(valid, convert<V>(g.volume), load_scalar_or_zero(at, a.grad_history)));
+    if (a.history.pointer) store_adjoint_of_history(a, at, valid, convert<V>(slope[kHardening]), convert<V>(g.volume));
   }
 
   template <class At, class T, int D>

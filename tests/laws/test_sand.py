@@ -864,10 +864,12 @@ def test_opcheck(device):
     ops, rule = torch.ops.torch_mpm, ("full", "radial", "zero")
     torch.library.opcheck(ops.quartic_return_map.default, (F, mu, lam, angle, None, None, None, *rule, False))
     once = ("test_schema", "test_autograd_registration", "test_faketensor")
-    grads, p = (F.detach(), None, None, None, None), [mu, lam, angle, angle, angle]
+    grads, p = (F.detach(), None, None, None, None), [mu, lam, angle, angle, angle, *[0 * mu] * 3]
     for op, arguments in (
         (ops.quartic_return_map, (F, mu, lam, angle, angle, volume, None, *rule, True)),
         (ops.law_update, (F, None, p, [volume], None, "sand_full", 2, 1, 7)),
+        (ops.law_update, (F, None, p, [volume], None, "sand_full", 2, 4, 7)),
+        (ops.law_update, (F, None, p, [volume, volume], None, "sand_full", 2, 4, 0)),
         (ops.law_update_backward, (*grads, F, None, p, [], None, "sand_full", 2, 0, 13)),
         (ops.law_update_backward, (*grads, F, None, p, [volume], None, "sand_full", 2, 0, 13)),
         (ops.law_energy, (F, p, [], None, "sand_full", 2)),
@@ -967,6 +969,61 @@ def test_law_with_history(device, flow):
     (grad,) = torch.autograd.grad(end.x.square().sum(), h0)
     assert grad.isfinite()
     assert float(grad) != 0
+
+
+@pytest.mark.parametrize("energy", ["unilateral", "full", "hencky", "mixed"])
+@pytest.mark.parametrize("tears", [False, True])
+def test_hardened_sand_has_the_friction_of_its_angle(device, dim, energy, tears):
+    """As sand of the friction angle that each particle has after hardening (Klár et al. 2016, equation 29)."""
+    F, mu, lam, _ = (t.to(device) for t in random_states(200, dim))
+    q = 3 * torch.rand(len(F), dtype=torch.float64).to(device)
+    volume = (0.01 * torch.randn_like(q)).clamp(min=0)
+    h0, h1, h2, h3 = KLAR
+    angle = h0 + (h1 * q - h3) * (-h2 * q).exp()
+    assert float(angle.amax() - angle.amin()) > 0.1
+    law = mpm.QuarticSand(mu=mu, lam=lam, energy=energy, cohesion=0.01, volume_correction=tears, hardening=KLAR)
+    x = torch.zeros(len(F), dim, dtype=torch.float64, device=device)
+    extra = {"hardening": q, **({"volume_correction": volume} if tears else {})}
+    state = mpm.State(x, x, torch.ones_like(q), torch.ones_like(q), F=F, extra=extra)
+    fields, stress = law.update(state)
+    expected = quartic_return_map(
+        F, mu, lam, angle, energy=energy, details=True, cohesion=0.01, volume_correction=volume if tears else None
+    )
+    torch.testing.assert_close(stress, expected.stress)
+    torch.testing.assert_close(fields["F"], expected.F)
+    torch.testing.assert_close(fields["hardening"], q + expected.multiplier)
+    assert float(expected.multiplier.amax()) > 0.01
+    if tears:
+        torch.testing.assert_close(fields["volume_correction"], expected.volume_correction)
+    assert set(fields) == {"F", *extra}
+
+
+@pytest.mark.parametrize("energy", ["unilateral", "full", "hencky", "mixed"])
+@pytest.mark.parametrize("tears", [False, True])
+def test_gradients_of_hardening(device, dim, energy, tears):
+    """Of every result, with respect to F, μ, λ, the slope, cohesion, h1 to h3 and history."""
+    F, mu, lam, angle = (t.to(device) for t in random_states(12, dim))
+    q = 2 * torch.rand(len(F), dtype=torch.float64).to(device)
+    slope = reference.friction_alpha(0.3 + 0.4 * angle, dim)
+    hardening = [torch.full_like(q, h) for h in KLAR[1:]]
+    history = [q, 1e-3 + 0.05 * torch.rand_like(q)] if tears else [q]  # A gap of zero is a kink.
+    leaves = [t.detach().clone().requires_grad_() for t in (F, mu, lam, slope, 0 * q + 0.01, *hardening, *history)]
+
+    def results(F, mu, lam, slope, cohesion, h1, h2, h3, *history):
+        parameters = [mu, lam, slope, cohesion, torch.zeros_like(mu), h1, h2, h3]
+        r = mpm.ops.law_update(f"sand_{energy}", F, parameters, history, options=["hardens"], details=True)
+        return r.state, r.stress, r.multiplier, r.dissipated, *r.history
+
+    torch.autograd.gradcheck(results, leaves, fast_mode=True)
+
+
+def test_hardening_needs_its_option(device):
+    F, mu, lam, angle = (t.to(device) for t in random_states(5, 2))
+    parameters, history = [mu, lam, angle, angle, *[0 * mu] * 4], [0 * mu] * 2
+    with pytest.raises(ValueError, match="sand_full has the history variables volume_correction, got 2 tensors"):
+        mpm.ops.law_update("sand_full", F, parameters, history)
+    with pytest.raises(RuntimeError, match="history must be at most 1 tensors for the law sand_full"):
+        torch.ops.torch_mpm.law_update(F, None, parameters, history, None, "sand_full", 2, 0, 0)
 
 
 def test_law_arguments():

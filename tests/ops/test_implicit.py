@@ -21,9 +21,9 @@ PARAMETERS = {
     "weakly_compressible": (5.0, 7.0),
     "snow": (2.0, 3.0, 0.02, 0.01, 5.0),
     "von_mises": (2.0, 3.0, 0.1, 0.5),
-    "sand_full": (2.0, 3.0, 0.3, 0.0, 1e-3),
-    "sand_unilateral": (2.0, 3.0, 0.3, 0.0, 1e-3),
-    "sand_hencky": (2.0, 3.0, 0.3, 0.0, 1e-3),
+    "sand_full": (2.0, 3.0, 0.3, 0.0, 1e-3, 0.0, 0.0, 0.0),
+    "sand_unilateral": (2.0, 3.0, 0.3, 0.0, 1e-3, 0.0, 0.0, 0.0),
+    "sand_hencky": (2.0, 3.0, 0.3, 0.0, 1e-3, 0.0, 0.0, 0.0),
 }
 ERROR = {torch.float32: 3e-6, torch.float64: 1e-13}
 
@@ -65,7 +65,7 @@ class Trial:
             self.state, self.before = F + move @ F, F
         self.weight = 0.5 + torch.rand(7).double()
         self.parameters = [torch.tensor(p, dtype=torch.float64) for p in PARAMETERS[law]]
-        self.history = [torch.full((7,), 0.05, dtype=torch.float64) for _ in ops.LAWS[law].history]
+        self.history = [torch.full((7,), 0.05, dtype=torch.float64) for _ in ops.LAWS[law].history_with(())]
         for name in ("state", "before", "weight"):
             setattr(self, name, getattr(self, name).to(device, dtype))
         for name in ("parameters", "history"):

@@ -162,7 +162,7 @@ def test_sand_of_a_scene_file():
     words["hardening"] = (35, 9, 0.2, 10)
     law = mpm.Scene(**disc(material={"jelly": words})).build("cpu").step.law
     assert law.values()[:2] == (2e6, 3e6)
-    expected = (math.radians(35), math.radians(9), 0.2, math.radians(10), 0.01, 0.05)
+    expected = (math.radians(35), 0.01, 0.05, math.radians(9), 0.2, math.radians(10))
     assert law.values()[2:] == pytest.approx(expected)
     assert (law.flow, law.extra_fields) == ("exact", ("volume_correction", "hardening"))
 

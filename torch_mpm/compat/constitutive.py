@@ -57,7 +57,7 @@ def von_mises(F: Tensor, mu: Tensor, limit: Tensor) -> Tensor:
 def drucker_prager(F: Tensor, mu: Tensor, lam: Tensor, friction_angle: Tensor, cohesion: Tensor) -> Tensor:
     """F on the cone of a friction angle [degrees], with its apex at the strain `cohesion` along every axis."""
     slope = friction_alpha(torch.deg2rad(friction_angle.to(F)), 3)
-    parameters = [mu.to(F), lam.to(F), slope, cohesion.to(F), torch.zeros_like(slope)]
+    parameters = [mu.to(F), lam.to(F), slope, cohesion.to(F), *[torch.zeros_like(slope)] * 4]
     return law_update("sand_hencky", F, parameters).state
 
 

@@ -113,7 +113,7 @@ class CompiledLaw(Material):
         info = LAWS[self.name]
         flows = info.plastic or bool(info.history)
         result = self.return_map(state, DISSIPATED if self.dissipation and flows else False)
-        fields = dict(zip(self.extra_fields, result.history, strict=True))
+        fields = dict(zip(self.history_names(), result.history, strict=True))
         if info.plastic:
             fields[info.field] = result.state
         if result.dissipated is not None:

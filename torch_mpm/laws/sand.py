@@ -11,8 +11,6 @@ from torch import Tensor
 
 from ..cuda_graphs.capture import DeviceConstantCache
 from ..errors import check_flag, check_number
-from ..ops.arguments import per_parameter
-from ..ops.law import DISSIPATED, MULTIPLIER
 from ..ops.registry import LAWS
 from ..ops.sand import ANGLE, ENERGIES, friction_alpha, law_name
 from .compiled import SolidLaw, check_value
@@ -115,14 +113,13 @@ class QuarticSand(SolidLaw):
             raise ValueError(f"h3 must not be above h0 (in radians), got {last} and {first}")
 
     def values(self) -> Sequence[Value]:
-        """μ and λ [Pa], the friction angle [rad] or the constants of its hardening, cohesion and smallest strain."""
-        friction = (getattr(self, name) for name in self._friction)
-        return *self._lame(), *friction, self.cohesion, self.smallest_strain
+        """μ and λ [Pa], the friction angle or h0 [rad], cohesion, smallest strain, and h1 to h3."""
+        angle, *hardening = (getattr(self, name) for name in self._friction)
+        return *self._lame(), angle, self.cohesion, self.smallest_strain, *(hardening or (0.0, 0.0, 0.0))
 
     def _arguments(self, state: State) -> tuple[Tensor, list[Tensor]]:
-        F, (mu, lam, *friction, cohesion, smallest) = super()._arguments(state)
-        slope = self._slope(self._friction_angle(friction, state), F.shape[1])
-        return F, [mu, lam, slope, cohesion, smallest]
+        F, (mu, lam, angle, *others) = super()._arguments(state)
+        return F, [mu, lam, self._slope(angle, F.shape[1]), *others]
 
     def _elastic_law(self, state: State, history: Sequence[Tensor]) -> tuple[str, list[Tensor], Sequence[str]]:
         return law_name(self.energy_form, "radial", 3), self._arguments(state)[1], ("elastic",)
@@ -131,40 +128,11 @@ class QuarticSand(SolidLaw):
         return law_name(self.energy_form, self.flow, state.x.shape[1])
 
     def _options(self) -> Sequence[str]:
-        return ("keep_apex",) if self.apex == "keep" else ()
-
-    def _friction_angle(self, constants: Sequence[Tensor], state: State) -> Tensor:
-        """Unchanged, or [P] after hardening (Klár et al. 2016, equation 29)."""
-        if HARDENING not in self.extra_fields:
-            return constants[0]
-        q = self._hardening(state)
-        h0, h1, h2, h3 = (per_parameter(h, state.scene, len(q)) for h in constants)
-        return h0 + (h1 * q - h3) * (-h2 * q).exp()
+        keeps, hardens = self.apex == "keep", HARDENING in self.extra_fields
+        return *(("keep_apex",) if keeps else ()), *(("hardens",) if hardens else ())
 
     def _slope(self, angle: Tensor, dim: int) -> Tensor:
         """α of the friction angle, cached while that has not changed and requires no gradient."""
-        if torch.compiler.is_compiling() or angle.requires_grad or HARDENING in self.extra_fields:
+        if torch.compiler.is_compiling() or angle.requires_grad:
             return friction_alpha(angle, dim)
         return self._kept_slope.get((angle, dim), lambda: friction_alpha(angle, dim), angle)
-
-    def _hardening(self, state: State) -> Tensor:
-        q = state.extra.get(HARDENING)
-        return torch.zeros_like(state.mass) if q is None else q
-
-    def is_all_of_its_update(self) -> bool:
-        return self._updates_as_compiled() and HARDENING not in self.extra_fields
-
-    def _updates_as_compiled(self) -> bool:
-        return type(self).update is QuarticSand.update
-
-    def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
-        hardens = HARDENING in self.extra_fields
-        result = self.return_map(state, DISSIPATED * self.dissipation | MULTIPLIER * hardens)
-        fields = {"F": result.state}
-        if self.volume_correction:
-            (fields[VOLUME],) = result.history
-        if result.multiplier is not None:
-            fields[HARDENING] = self._hardening(state) + result.multiplier
-        if result.dissipated is not None:
-            fields["dissipated"] = result.dissipated
-        return fields, result.stress

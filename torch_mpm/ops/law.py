@@ -87,7 +87,7 @@ def law_update(
     Raises:
         ValueError, TypeError: for an unknown law or option, or wrong shapes, dtypes or devices.
     """
-    dim = _check(law, state, parameters, history, scene, dim, scenes)
+    dim = _check(law, state, parameters, history, scene, dim, scenes, options)
     if C is not None and not LAWS[law].viscous:
         raise ValueError(f"{law} has no viscosity: C must be None")
     check_like("C", C, state, (state.shape[0], dim, dim), "[P, D, D]")
@@ -242,8 +242,9 @@ def _check(
     scene: Tensor | None,
     dim: int | None,
     scenes: int | None,
+    options: Sequence[str] | None = None,
 ) -> int:
-    """Checks shared by all ops; returns the dimension."""
+    """Checks shared by all ops, and those of history for the options of an op with options; returns the dimension."""
     check_choice("law", law, LAWS)
     info = LAWS[law]
     dim = _check_state(info, state, dim)
@@ -253,9 +254,11 @@ def _check(
     check_tensors(law, "parameters", info.parameters, parameters)
     for quantity, value in zip(info.parameters, parameters, strict=True):
         check_parameter(quantity.name, value, state, scene, scenes)
-    if history or not info.optional_history:
-        check_tensors(law, "history variables", info.history, history)
-    for quantity, value in zip(info.history, history, strict=False):
+    variables = info.history if options is None else info.history_with(options)
+    if info.optional_history:
+        variables = variables[: len(history)]
+    check_tensors(law, "history variables", variables, history)
+    for quantity, value in zip(variables, history, strict=True):
         P = state.shape[0]
         if value is None:
             raise TypeError(f"{quantity.name} must be a tensor, got None")

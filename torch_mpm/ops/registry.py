@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import Any
 
 from .. import _library
@@ -18,6 +19,7 @@ class Quantity:
         low, high: ends of its range; infinite ends mean any finite number.
         with_low, with_high: whether a finite end is in the range.
         matrix: whether a history variable has D by D entries per particle.
+        option: the option without which a law does not have a history variable, or None.
     """
 
     name: str
@@ -27,6 +29,7 @@ class Quantity:
     with_low: bool
     with_high: bool
     matrix: bool
+    option: str | None
 
     def holds(self, value: Any) -> Any:
         """Whether a number, or each entry of a tensor, is in the range; infinite values are."""
@@ -53,7 +56,7 @@ class LawInfo:
         field: field of the deformation that it reads and updates: "F" or "J".
         viscous: whether its stress reads C.
         plastic: whether it changes F.
-        optional_history: whether it works without its history.
+        optional_history: whether it works without its history, or with the first variables alone.
         twice_differentiable, twice_differentiable_energy: whether its stress, and its energy, has second derivatives.
         has_tangent: whether it has `law_tangent`, which implicit steps need.
         in_2d: whether it exists in two dimensions.
@@ -75,6 +78,10 @@ class LawInfo:
     parameters: tuple[Quantity, ...]
     history: tuple[Quantity, ...]
     options: tuple[str, ...]
+
+    def history_with(self, options: Sequence[str]) -> tuple[Quantity, ...]:
+        """The history that the law has with these options, in its order."""
+        return tuple(q for q in self.history if q.option is None or q.option in options)
 
     @property
     def rate_dependent(self) -> bool:

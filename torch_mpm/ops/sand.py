@@ -144,12 +144,12 @@ def quartic_return_map(
     if alpha is None:
         alpha = friction_alpha(_parameter("friction_angle", friction_angle, F, scene, scenes), F.shape[1])
     given = (("mu", mu), ("lam", lam), ("alpha", alpha), ("cohesion", 0.0 if cohesion is None else cohesion))
-    parameters = [_parameter(n, v, F, scene, scenes) for n, v in given]
+    parameters = [_parameter(n, v, F, scene, scenes) for n, v in (*given, *_UNUSED)]
     history = () if volume_correction is None else (volume_correction,)
     result = law_update(
         law_name(energy, flow, F.shape[1]),
         F,
-        [*parameters, _parameter("smallest_strain", 0.0, F, scene, scenes)],
+        parameters,
         history,
         scene=scene,
         options=["keep_apex"] if apex == "keep" else [],
@@ -245,7 +245,11 @@ def _elastic(
     """Parameters of a law of sand for functions that need no yield surface."""
     _check_deformation(F, scene, energy, scenes)
     values = (("mu", mu), ("lam", lam), ("alpha", 0.0), ("cohesion", 0.0), ("smallest_strain", smallest_strain))
-    return [_parameter(name, value, F, scene, scenes) for name, value in values]
+    return [_parameter(name, value, F, scene, scenes) for name, value in (*values, *_UNUSED[1:])]
+
+
+_UNUSED = (("smallest_strain", 0.0), ("h1", 0.0), ("h2", 0.0), ("h3", 0.0))
+"""Parameters of the stiffness and of hardening."""
 
 
 def _check_deformation(F: Tensor, scene: Tensor | None, energy: str, scenes: int | None = None) -> None:
