@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ import numpy as np
 from .. import optional
 from .stress import CAUCHY, explicit_name
 from .trajectory import Array, Trajectory, find
-from .whole_files import building_path, remove_leftovers
+from .whole_files import output_folder, output_path, replacing
 
 
 def export_vtk(run: str | Path, out: str | Path | None = None) -> Path:
@@ -31,10 +30,11 @@ def export_vtk(run: str | Path, out: str | Path | None = None) -> Path:
 
     Raises:
         FileNotFoundError: when there is no trajectory.
+        DamagedFileError: for a trajectory that is damaged, or a link out of its folder in place of the output.
         ImportError: when meshio is missing (extra ``data``).
     """
     folder = _folder(run, out, "vtk")
-    with Trajectory(run) as trajectory:
+    with Trajectory(run) as trajectory, output_folder(folder):
         return write_vtk(trajectory, folder, trajectory.measures)
 
 
@@ -44,7 +44,7 @@ def export_ply(run: str | Path, out: str | Path | None = None) -> Path:
     Arguments and errors as for :func:`export_vtk`.
     """
     folder = _folder(run, out, "ply")
-    with Trajectory(run) as trajectory:
+    with Trajectory(run) as trajectory, output_folder(folder):
         return write_ply(trajectory, folder)
 
 
@@ -70,7 +70,8 @@ def write_vtk(frames: Iterable[dict[str, Array]], folder: Path, measures: Mappin
         _write(folder / name, _mesh(frame["position"], cells, {**data, "id": np.arange(count)}), {})
         ElementTree.SubElement(listing, "DataSet", timestep=f"{float(frame['time']):.9g}", file=name)
     index = folder / "run.pvd"
-    ElementTree.ElementTree(collection).write(index, xml_declaration=True)
+    with replacing(index) as building:
+        ElementTree.ElementTree(collection).write(building, xml_declaration=True)
     return index
 
 
@@ -85,10 +86,7 @@ def write_ply(frames: Iterable[dict[str, Array]], folder: Path) -> Path:
 
 
 def _folder(run: str | Path, out: str | Path | None, name: str) -> Path:
-    folder = find(run).parent / name if out is None else Path(out)
-    folder.mkdir(parents=True, exist_ok=True)
-    remove_leftovers(folder)
-    return folder
+    return output_path(find(run).parent, name, out)
 
 
 def meshio_module() -> Any:
@@ -101,13 +99,8 @@ def _mesh(position: Array, cells: list[Any], data: dict[str, Array]) -> Any:
 
 def _write(path: Path, mesh: Any, options: dict[str, Any]) -> None:
     """Write a file that appears only when it is complete."""
-    building = building_path(path)
-    try:
+    with replacing(path) as building:
         meshio_module().write(building, mesh, file_format=path.suffix[1:], **options)
-        os.replace(building, path)
-    except BaseException:
-        building.unlink(missing_ok=True)
-        raise
 
 
 def _per_particle(frame: dict[str, Array]) -> dict[str, Array]:

@@ -11,6 +11,7 @@ import numpy as np
 from .folder import DatasetError, DatasetFolder, velocity_of
 from .shard import Array, StoredScene
 from .statistics import BOUNDARY
+from .whole_files import output_folder, output_path
 
 SAMPLED = 32
 """Maximum number of scenes that are read for motions and energies."""
@@ -57,7 +58,7 @@ def draw_statistics(dataset: str | Path | DatasetFolder, out: str | Path | None 
     valid = data.scenes()
     if not valid:
         raise DatasetError(f"{data.path} has no valid scene yet")
-    target = data.path / "statistics.png" if out is None else Path(out)
+    target = output_path(data.path, "statistics.png", out)
     if target.suffix.lower() != ".png":
         raise DatasetError(f"out must be the name of a PNG file, NAME.png, got {str(target)!r}")
     chosen = np.unique(np.linspace(0, len(valid) - 1, SAMPLED).round().astype(int))
@@ -76,8 +77,8 @@ def draw_statistics(dataset: str | Path | DatasetFolder, out: str | Path | None 
     picture.suptitle(f"{data.record.title or data.path.name}: {len(valid)} scenes, {len(scenes)} of them read")
     picture.tight_layout()
     picture.canvas.draw()
-    target.parent.mkdir(parents=True, exist_ok=True)
-    write_png(target, np.ascontiguousarray(np.asarray(picture.canvas.buffer_rgba())[..., :3]))
+    with output_folder(target.parent):
+        write_png(target, np.ascontiguousarray(np.asarray(picture.canvas.buffer_rgba())[..., :3]))
     return target
 
 

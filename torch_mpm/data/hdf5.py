@@ -8,13 +8,14 @@ too.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import io
 import json
 import math
 import os
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -22,6 +23,7 @@ from .. import optional
 from ..errors import DamagedFileError
 from ..files import check_file
 from . import host_memory
+from .whole_files import named_errors
 
 Extents = Sequence[tuple[int, int]]
 """Parts of a file: (offset, length) [bytes]."""
@@ -104,19 +106,40 @@ class QuietFile(_File):
         except OSError as error:
             self.error = self.error or error
 
+    def check(self) -> None:
+        """Raise the OSError of data that could not be written."""
+        if self.error is not None:
+            raise self.error
+
     def sync(self) -> None:
         """Wait until all data is on the disk.
 
         Raises:
             OSError: for data that could not be written.
         """
-        if self.error is None:
-            os.fsync(self._descriptor)
-        else:
-            raise self.error
+        self.check()
+        os.fsync(self._descriptor)
 
     def close(self) -> None:
         os.close(self._descriptor)
+
+
+@contextlib.contextmanager
+def new_file(path: Path) -> Iterator[tuple[Any, QuietFile]]:
+    """New h5py.File, and the file below it, whose `check` ends a long block early when the disk is full.
+
+    Raises:
+        OSError: with the path, for data that could not be written.
+        ImportError: when h5py is missing (extra ``data``).
+    """
+    with named_errors(path), contextlib.closing(QuietFile(path)) as disk:
+        try:
+            with h5py_module().File(disk, "w") as file:
+                yield file, disk
+        except READ_ERRORS:
+            disk.check()  # HDF5 cannot read back what was not written.
+            raise
+        disk.sync()
 
 
 class SparseFile(_File):

@@ -14,7 +14,7 @@ import numpy as np
 from .folder import DatasetError, DatasetFolder, velocity_of
 from .shard import Array, StoredScene
 from .stress import DrawnStress, drawn_stress
-from .whole_files import remove_leftovers
+from .whole_files import output_folder, output_path
 
 SHEET, VIDEO = "sheet.png", "scenes.mp4"
 SHOWN = 6
@@ -62,16 +62,15 @@ def draw_scenes(
     chosen = [scene.id for scene in data.scenes()[:SHOWN]] if scenes is None else list(scenes)
     if not chosen:
         raise DatasetError(f"{data.path} has no valid scene yet")
-    target = data.path / "pictures" if out is None else Path(out)
+    target = output_path(data.path, "pictures", out)
     length, interval = data.record.frames, data.record.frame_interval
     with contextlib.ExitStack() as stack:
         columns = max(1, frames)
         artist = stack.enter_context(_Artist(data, chosen, color_by, max(160, width // columns)))
         times = np.linspace(0, length - 1, columns).round().astype(int)
         pictures = [artist.picture(scene, int(k)) for scene in range(len(chosen)) for k in times]
-        target.mkdir(parents=True, exist_ok=True)
-        remove_leftovers(target)
-        write_png(target / SHEET, contact_sheet(pictures, columns, width))
+        with output_folder(target):
+            write_png(target / SHEET, contact_sheet(pictures, columns, width))
     if not video:
         return [target / SHEET]
     every = max(1, math.ceil(1 / (interval * MOST_FPS)))

@@ -72,8 +72,7 @@ class ShardWriter:
                 _write_chunks(group, name, values)
             else:
                 _write_array(group, name, values)
-        if self._disk.error is not None:
-            raise self._disk.error
+        self._disk.check()
         record = SceneRecord(
             scene_id,
             bool(attributes["valid"]),

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
 import re
 import shutil
 import socket
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -36,13 +37,48 @@ def write_whole(path: Path, data: bytes) -> None:
     """
     building = building_path(path)
     try:
-        with open(building, "wb") as handle:
-            handle.write(data)
-            handle.flush()
-            os.fsync(handle.fileno())
-        appear(building, path)
+        with named_errors(path, building):
+            with open(building, "wb") as handle:
+                handle.write(data)
+                handle.flush()
+                os.fsync(handle.fileno())
+            appear(building, path)
     except BaseException:
         building.unlink(missing_ok=True)
+        raise
+
+
+@contextlib.contextmanager
+def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Temporary path beside ``path`` that is renamed to it when the block succeeds and removed when it fails."""
+    target = Path(path)
+    temporary = building_path(target, target.suffix)
+    try:
+        with named_errors(target, temporary):
+            yield temporary
+            with open(temporary, "rb") as file:
+                os.fsync(file.fileno())
+            os.replace(temporary, target)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def named_errors(path: Path, building: Path | None = None) -> Iterator[None]:
+    """Name a file in the errors of the operating system in the block.
+
+    Args:
+        path: the file where an error names none, as for a failed write.
+        building: the incomplete file or folder that becomes ``path``, which errors name in its place.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.strerror:
+            named = Path(os.fsdecode(error.filename)) if isinstance(error.filename, (str, bytes)) else path
+            if building is not None and named.is_relative_to(building):
+                named = path / named.relative_to(building)
+            error.filename = str(named)
         raise
 
 
@@ -84,6 +120,35 @@ def check_inside(folder: Path, path: Path, remedy: str) -> None:
     """
     if not path.resolve().is_relative_to(folder.resolve()):
         raise DamagedFileError(path, f"is a link to a place outside of {folder}", remedy)
+
+
+def output_path(folder: Path, name: str, out: str | Path | None = None) -> Path:
+    """``out``, or by default ``name`` in a folder, which may be a received one.
+
+    Raises:
+        DamagedFileError: where the default is a link to a place outside of the folder.
+    """
+    if out is not None:
+        return Path(out)
+    check_inside(folder, folder / name, "remove the link, or choose another output")
+    return folder / name
+
+
+@contextlib.contextmanager
+def output_folder(path: Path) -> Iterator[None]:
+    """Create a folder for the files of the block, without the remains of ended processes; a block that fails before its
+    first file leaves no new folder.
+    """
+    new = not path.exists()
+    path.mkdir(parents=True, exist_ok=True)
+    remove_leftovers(path)
+    try:
+        yield
+    except BaseException:
+        if new:
+            with contextlib.suppress(OSError):
+                path.rmdir()
+        raise
 
 
 def building_path(path: Path, suffix: str = "") -> Path:

@@ -4,32 +4,17 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from pathlib import Path
+from collections.abc import Sequence
 
 import numpy as np
 
-from ..data.whole_files import building_path
+from ..data.whole_files import replacing
+from ..files import check_file
 from .requires import require
 from .shapes import Array
 
 NOTE = "torch_mpm"
 """Key of the note in a PNG file."""
-
-
-@contextmanager
-def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Temporary path beside `path` that is renamed to it when the block succeeds and removed when it fails."""
-    target = Path(path)
-    temporary = building_path(target, target.suffix)
-    try:
-        yield temporary
-        with open(temporary, "rb") as file:
-            os.fsync(file.fileno())
-        os.replace(temporary, target)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def check_image(name: str, image: Array) -> Array:
@@ -58,6 +43,7 @@ def write_png(path: str | os.PathLike[str], image: Array, width: int | None = No
 def note_of(path: str | os.PathLike[str]) -> str:
     """Return the note that `write_png` stored in a file; "" for a file without one or without a picture."""
     try:
+        check_file(os.fspath(path), "picture")
         with require("PIL.Image").open(path) as picture:
             return str(picture.info.get(NOTE, ""))
     except Exception:  # For any defect of the file.

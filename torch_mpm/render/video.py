@@ -12,8 +12,9 @@ from typing import IO
 
 import numpy as np
 
+from ..data.whole_files import replacing
 from ..interrupts import held_signals
-from .images import check_image, read_png, replacing
+from .images import check_image, read_png
 from .requires import RenderError, require
 from .shapes import Array
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..data.stress import DrawnStress, drawn_stress
 from ..data.trajectory import Array, Trajectory
-from ..data.whole_files import remove_leftovers
+from ..data.whole_files import output_folder, output_path, remove_leftovers
 from . import check, schema
 from .explain import SceneError
 from .fields import RANKS
@@ -33,7 +33,7 @@ def draw(folder: str | Path, scene: Scene, progress: Any = None) -> list[Path]:
 
     Raises:
         FileNotFoundError: when there is no trajectory, or it has no frame yet.
-        DamagedFileError: for a trajectory that is damaged.
+        DamagedFileError: for a trajectory that is damaged, or links out of the folder.
         SceneError: when `scene.render` does not fit the trajectory.
         ImportError: when a package of the extra ``render`` is missing.
     """
@@ -41,11 +41,9 @@ def draw(folder: str | Path, scene: Scene, progress: Any = None) -> list[Path]:
     from ..render.images import note_of
 
     words = scene.render or schema.Render()
-    target = Path(folder) / FOLDER
-    target.mkdir(exist_ok=True)
-    for own in (Path(folder), target):
-        remove_leftovers(own)
-    with Trajectory(folder) as trajectory:
+    target, video = (output_path(Path(folder), name) for name in (FOLDER, VIDEO))
+    remove_leftovers(Path(folder))
+    with Trajectory(folder) as trajectory, output_folder(target):
         if not len(trajectory):
             raise FileNotFoundError(f"{trajectory.path} has no frames yet")
         problems = list(_problems(scene, words, trajectory))
@@ -62,7 +60,6 @@ def draw(folder: str | Path, scene: Scene, progress: Any = None) -> list[Path]:
         artist.close()
     if not words.video:
         return paths
-    video = Path(folder) / VIDEO
     assemble_video(paths, video, scene.frames / scene.duration / words.every)
     return [*paths, video]
 

@@ -19,7 +19,7 @@ from ..host_memory import in_words
 from ..metadata import metadata, write_metadata
 from ..statistics import BOUNDARY
 from ..stress import explicit_name
-from ..whole_files import building_path, remove_leftovers
+from ..whole_files import building_path, named_errors, output_path, remove_leftovers
 
 Array = npt.NDArray[Any]
 
@@ -108,7 +108,7 @@ def exporting(
         DamagedFileError: for a data set that is damaged.
     """
     dataset = source if isinstance(source, DatasetFolder) else DatasetFolder(source)
-    target = dataset.path / name if out is None else Path(out)
+    target = output_path(dataset.path, name, out)
     words = metadata(dataset, material=material)
     dataset.check()
     with new_folder(target) as folder:
@@ -133,19 +133,20 @@ def new_folder(target: Path) -> Iterator[Path]:
     Raises:
         FileExistsError: when the name exists already.
     """
-    if target.exists():
+    if os.path.lexists(target):
         raise FileExistsError(errno.EEXIST, "exists already; remove it, or choose another folder", str(target))
     target.parent.mkdir(parents=True, exist_ok=True)
     remove_leftovers(target.parent)
     building = building_path(target)
     shutil.rmtree(building, ignore_errors=True)
-    building.mkdir()
     try:
-        yield building
-        for path in [*building.rglob("*"), building]:
-            _sync(path)
-        building.rename(target)
-        _sync(target.parent)
+        with named_errors(target, building):
+            building.mkdir()
+            yield building
+            for path in [*building.rglob("*"), building]:
+                _sync(path)
+            building.rename(target)
+            _sync(target.parent)
     finally:
         shutil.rmtree(building, ignore_errors=True)
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ..folder import DatasetError, DatasetFolder
+from ..whole_files import named_errors
 from .common import Export, ExportedScene, exporting
 
 ANGLES = ("friction_angle",)
@@ -48,7 +49,9 @@ def _write(export: Export, split: str, material: str | None) -> None:
     for k, scene in enumerate(scenes):
         data[k] = scene
     if scenes:
-        np.savez(export.folder / f"{split}.npz", gns_data=data)
+        path = export.folder / f"{split}.npz"
+        with named_errors(path):
+            np.savez(path, gns_data=data)
 
 
 def _entry(scene: ExportedScene, material: str | None) -> tuple[np.ndarray, ...]:

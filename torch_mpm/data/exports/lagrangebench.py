@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..folder import DatasetError, DatasetFolder
-from ..hdf5 import h5py_module
+from ..hdf5 import new_file
 from ..metadata import particle_spacing
 from ..statistics import BOUNDARY
 from .common import PARTICLE_TYPES, RIGID, Array, Export, ExportedScene, exporting, fields_of
@@ -61,13 +61,14 @@ def _codes(dataset: DatasetFolder) -> dict[int, int]:
 
 def _write(export: Export, split: str, codes: dict[int, int], fields: Sequence[str]) -> None:
     path = export.folder / f"{split}.h5"
-    with h5py_module().File(path, "w") as file:
+    with new_file(path) as (file, disk):
         for k, scene in enumerate(export.scenes(split)):
             group = file.create_group(f"{k:05d}")
             group.create_dataset("position", data=scene.position, compression="gzip", compression_opts=1, shuffle=True)
             group.create_dataset("particle_type", data=_types(scene, codes))
             for name, values in fields_of(scene, fields).items():
                 group.create_dataset(name, data=values, compression="gzip", compression_opts=1, shuffle=True)
+            disk.check()
         empty = not len(file)
     if empty:
         path.unlink()

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ..folder import DatasetFolder
-from ..hdf5 import h5py_module
+from ..hdf5 import new_file
 from .common import exporting, fields_of
 
 log = logging.getLogger(__name__)
@@ -26,7 +26,6 @@ def export_neuralmpm(
 
     Args, returns and errors as :func:`export_lagrangebench`.
     """
-    h5py = h5py_module()
     with exporting(dataset, out, "neuralmpm") as export:
         if export.dataset.record.dim != 2:
             log.warning("NeuralMPM reads scenes in 2-D alone; those of this data set are in 3-D")
@@ -34,7 +33,7 @@ def export_neuralmpm(
             folder = export.folder / split
             folder.mkdir()
             for k, scene in enumerate(export.scenes(split)):
-                with h5py.File(folder / f"sim_{k}.h5", "w") as file:
+                with new_file(folder / f"sim_{k}.h5") as (file, _):
                     free = ~scene.boundary
                     for name, rows in (("particles", free), ("boundary", scene.boundary)):
                         values = scene.position[:, rows]

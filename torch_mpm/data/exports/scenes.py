@@ -11,6 +11,7 @@ import numpy as np
 from ..export import Array, write_ply, write_vtk
 from ..folder import DatasetFolder, velocity_of
 from ..shard import StoredScene, scene_name
+from ..whole_files import output_path
 from .common import new_folder
 
 
@@ -51,7 +52,7 @@ def _export(
     write: Callable[[StoredScene, Iterable[dict[str, Array]], Path], Any],
 ) -> Path:
     dataset = source if isinstance(source, DatasetFolder) else DatasetFolder(source)
-    target = dataset.path / name if out is None else Path(out)
+    target = output_path(dataset.path, name, out)
     chosen = [scene.id for scene in dataset.scenes()[:1]] if scenes is None else scenes
     stored = {number: dataset.scene(number) for number in chosen}
     with new_folder(target) as folder:

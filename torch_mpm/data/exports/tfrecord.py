@@ -17,6 +17,7 @@ import numpy as np
 
 from ... import optional
 from ..folder import DatasetError, DatasetFolder
+from ..whole_files import named_errors
 from .common import Array, ExportedScene, exported_ids, exporting, fields_of
 
 log = logging.getLogger(__name__)
@@ -55,7 +56,8 @@ def export_tfrecord(
         for split in record.splits:
             if not exported_ids(export.dataset, split):
                 continue
-            with open(export.folder / f"{split}.tfrecord", "wb") as file:
+            path = export.folder / f"{split}.tfrecord"
+            with named_errors(path), open(path, "wb") as file:
                 for k, scene in enumerate(export.scenes(split)):
                     frames = _frames(scene, fields, _gravity(source, scene.id) if context else None)
                     _write_record(file, _sequence_example(k, scene.particle_type, frames), checksum)

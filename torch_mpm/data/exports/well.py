@@ -12,10 +12,11 @@ import numpy as np
 import torch
 
 from ..folder import DatasetError, DatasetFolder, velocity_of
-from ..hdf5 import h5py_module
+from ..hdf5 import h5py_module, new_file
 from ..obstacle_fields import obstacle_mask, obstacles_of
 from ..rasterise import cell_centres, rasterise
 from ..statistics import Sums
+from ..whole_files import write_whole
 from .common import Array, Export, ExportedScene, exported_ids, exporting
 
 AXES = ("x", "y", "z")
@@ -52,7 +53,7 @@ def export_well(dataset: str | Path | DatasetFolder, out: str | Path | None = No
             if exported_ids(export.dataset, split):
                 statistics[split] = _write(export, split, name, dx or 2 * record.dx, orders, kept)
         chosen = statistics.get("train") or next(iter(statistics.values()))
-        (export.folder / "stats.yaml").write_text(json.dumps(chosen.words(), indent=1))  # JSON is valid YAML.
+        write_whole(export.folder / "stats.yaml", json.dumps(chosen.words(), indent=1).encode())  # JSON is valid YAML.
     return export.target
 
 
@@ -87,7 +88,7 @@ def _write(
     statistics = _Statistics(orders, record.dim)
     folder = export.folder / "data" / split
     folder.mkdir(parents=True)
-    with h5py_module().File(folder / f"{name}.hdf5", "w") as file:
+    with new_file(folder / f"{name}.hdf5") as (file, disk):
         file.attrs.update(
             {"dataset_name": name, "grid_type": "cartesian", "n_spatial_dims": record.dim, "n_trajectories": count}
         )
@@ -103,6 +104,7 @@ def _write(
             statistics.add(values)
             for field, data in values.items():
                 fields[field][k] = data
+            disk.check()
     return statistics
 
 
