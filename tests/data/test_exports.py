@@ -13,8 +13,9 @@ h5py = pytest.importorskip("h5py")
 pytest.importorskip("google_crc32c")
 
 from torch_mpm import data  # noqa: E402
+from torch_mpm.data import whole_files  # noqa: E402
 from torch_mpm.data.exports import common, lagrangebench  # noqa: E402
-from torch_mpm.data.folder import DatasetFolder  # noqa: E402
+from torch_mpm.data.folder import DatasetError, DatasetFolder  # noqa: E402
 from torch_mpm.data.packing import prepare_scene  # noqa: E402
 from torch_mpm.data.shard import record_path, shard_path  # noqa: E402
 from torch_mpm.data.shard_writer import ShardWriter  # noqa: E402
@@ -272,6 +273,15 @@ def test_the_well_reads_it(source, tmp_path):
                 assert len(statistics["mean_delta"]["velocity"]) == dim
 
 
+def with_arrays(source, change):
+    """The first shard of a data set, with scenes of changed arrays."""
+    dim = DatasetFolder(source).record.dim
+    with ShardWriter(shard_path(source, 0)) as writer:
+        for k in range(4):
+            writer.add(k, prepare_scene(change(datasets.arrays(0, dim))), datasets.scene_attributes(k, dim=dim))
+        writer.finish()
+
+
 def with_words(source, words):
     """The scenes of a data set with other scene files."""
     data = DatasetFolder(source)
@@ -315,6 +325,23 @@ def test_the_well_has_obstacles_and_scalars(tmp_path):
                 clear = abs(away - 0.2**2) > 1e-9
                 np.testing.assert_array_equal(fields["obstacle"][t].numpy()[clear], expected[clear])
     assert json.loads((folder / "stats.yaml").read_text())["std"]["obstacle"] > 0.1
+
+
+TITLES = ["x" * 400, "é" * 200, "沙" * 300, "con", "A title / with: signs\\"]
+
+
+@pytest.mark.parametrize("title", TITLES, ids=range(len(TITLES)))
+def test_files_of_the_well_have_names_for_every_file_system(tmp_path, title):
+    source = datasets.make_dataset(tmp_path / "set", shards=1, title=title)
+    (path,) = (data.export_well(source, dx=0.5) / "data" / "train").iterdir()
+    assert len(path.name.encode()) <= 110 and not whole_files.RESERVED.fullmatch(path.stem)
+    with h5py.File(path) as file:
+        assert file.attrs["dataset_name"] == path.stem
+
+
+def test_long_titles_give_different_names():
+    names = {whole_files.file_name("x" * 200 + end) for end in ("", "y", "z")}
+    assert len(names) == 3 and whole_files.file_name("Sand in 2-D!") == "sand_in_2_d"
 
 
 # ---- physics_jepa, which reads the files of The Well in its own way
@@ -409,6 +436,40 @@ def test_fields_that_are_not_there(flat, tmp_path, export):
     if export is data.export_tfrecord:
         with pytest.raises(ValueError, match=r"fields must be arrays \[T, N, ...\], got 'mass'"):
             export(flat, tmp_path / "out", fields=["mass"])
+
+
+@pytest.mark.parametrize("name", ["position", "particle_type"])
+@pytest.mark.parametrize("export", [data.export_lagrangebench, data.export_neuralmpm, data.export_tfrecord])
+def test_fields_that_every_export_has(flat, tmp_path, export, name):
+    with pytest.raises(DatasetError, match=f"fields must be of .*, got '{name}', which every export has"):
+        export(flat, tmp_path / "out", fields=["velocity", name])
+    assert list(tmp_path.iterdir()) == []
+
+
+OWN_NAMES = [
+    (data.export_neuralmpm, "particles"),
+    (data.export_neuralmpm, "boundary"),
+    (data.export_neuralmpm, "types"),
+    (data.export_tfrecord, "step_context"),
+]
+
+
+@pytest.mark.parametrize(("export", "name"), OWN_NAMES)
+def test_fields_with_a_name_of_the_format(tmp_path, export, name):
+    source = datasets.make_dataset(tmp_path / "set", shards=0)
+    with_arrays(source, lambda arrays: {**arrays, name: arrays["velocity"]})
+    with pytest.raises(DatasetError, match=f"fields: '{name}' would be written as '{name}', a name of another array"):
+        export(source, tmp_path / "out", fields=[name])
+
+
+def test_two_fields_with_one_name(tmp_path):
+    """A stress without a measure in its name becomes that with it."""
+    source = datasets.make_dataset(tmp_path / "set", shards=0)
+    stress = np.zeros((FRAMES, 20, 2, 2), np.float32)
+    with_arrays(source, lambda arrays: {**arrays, "stress": stress, "cauchy_stress": stress})
+    data.export_lagrangebench(source, tmp_path / "once", fields=["stress", "stress"])
+    with pytest.raises(DatasetError, match="fields: 'cauchy_stress' would be written as 'cauchy_stress', a name"):
+        data.export_lagrangebench(source, tmp_path / "out", fields=["stress", "cauchy_stress"])
 
 
 # ---- for people

@@ -154,7 +154,9 @@ def test_sums_of_another_number_of_dimensions(tmp_path):
         DatasetFolder(path).motion()
 
 
-@pytest.mark.parametrize("name", ["../out", "/tmp/out", "a/b", "..", "", "a\0", "train\n", "..\\out"])
+@pytest.mark.parametrize(
+    "name", ["../out", "/tmp/out", "a/b", "..", "", "a\0", "train\n", "..\\out", "x" * 300, "con", "LPT1", "nul "]
+)
 @pytest.mark.parametrize("key", ["splits", "fields"])
 def test_names_that_lead_out_of_the_folder(tmp_path, name, key):
     """A split of a data set from elsewhere names the files of exports."""

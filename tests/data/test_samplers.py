@@ -123,6 +123,8 @@ def test_distributions_that_cannot_be(words, message):
         ({"dataset__splits": {}}, "dataset.splits: "),
         ({"dataset__splits": {"train": 0}}, "dataset.splits: has no scenes"),
         ({"dataset__splits": {"../x": 1}}, "dataset.splits"),
+        ({"dataset__splits": {"x" * 101: 1}}, f"dataset.splits.{'x' * 101}: value error, takes a name"),
+        ({"dataset__splits": {"Con": 1}}, "dataset.splits.Con: value error, takes a name of at most 100 letters"),
         ({"dataset__fields": ["speed"]}, "dataset.fields[0]: takes one of 'velocity'"),
         ({"dataset__fields": ["temperature"]}, "dataset.fields: temperature needs a [heat] table"),
         ({"grid__dx": {"uniform": [0.1, 0.2]}}, "grid.dx: takes no distribution"),

@@ -33,7 +33,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, ValidationError
+from pydantic import AfterValidator, Field, ValidationError
 
 from ..files import check_file
 from ..scene import Scene, SceneError, schema
@@ -45,7 +45,7 @@ from .content_checks import shape_problems, value_problems
 from .distribution import Words
 from .folder import MOST_SHARDS
 from .stress import MEASURES
-from .whole_files import NAME
+from .whole_files import LONGEST_NAME, is_name
 
 FORMAT = 2
 """Version, increased whenever the same configuration would give other scenes."""
@@ -66,7 +66,15 @@ PARTICLE_TYPES = {"weakly_compressible": 5, "quartic_sand": 6}
 """DeepMind's codes by law: water and sand; all others are goop."""
 GOOP = 7
 
-Name = Annotated[str, Field(pattern=f"^{NAME.pattern}$")]
+
+def _checked_name(name: str) -> str:
+    if not is_name(name):
+        letters = f"at most {LONGEST_NAME} letters, digits, - and _ that are not the name of a device such as con"
+        raise ValueError(f"takes a name of {letters}")
+    return name
+
+
+Name = Annotated[str, AfterValidator(_checked_name)]
 Code = Annotated[int, Field(ge=0, le=8)]
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from ..errors import DamagedFileError
 from .shard import REMEDY, Array, SceneRecord, Shard, ShardRecord, StoredScene, record_path, scene_name, shard_path
 from .statistics import Motion, Sums
-from .whole_files import NAME, check_inside, check_record, count, write_record
+from .whole_files import check_inside, check_record, count, is_name, write_record
 
 FORMAT = 2
 FORMAT_WITHOUT_CHECKSUM = 1
@@ -191,8 +191,8 @@ class DatasetRecord:
             few = max(record.shards, record.scenes_per_shard) <= MOST_SHARDS
             if not (few and 2 <= record.dim <= 3 and all(0 < size < math.inf for size in sizes)):
                 raise ValueError("its numbers make no sense")
-            if wrong := [n for n in (*record.splits, *record.fields) if not NAME.fullmatch(n)]:
-                raise ValueError(f"{wrong[0]!r} is no name of a split or a field")
+            if wrong := [n for n in (*record.splits, *record.fields) if not is_name(n)]:
+                raise ValueError(f"{wrong[0]!r:.100} is no name of a split or a field")
             ends = [0, *(first + count for _, first, count in record.ranges)]
             if any(n not in record.splits or f < e or c < 0 for (n, f, c), e in zip(record.ranges, ends, strict=False)):
                 raise ValueError("its splits overlap, or have a negative number of scenes")

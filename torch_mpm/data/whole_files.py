@@ -16,8 +16,12 @@ from typing import Any
 
 from ..errors import DamagedFileError
 
-NAME = re.compile(r"[A-Za-z0-9_-]+")
-"""Names that are allowed in paths."""
+LONGEST_NAME = 100
+"""Length of the longest name in paths [bytes]; file systems allow 255, with the suffix of an incomplete file."""
+NAME = re.compile(rf"[A-Za-z0-9_-]{{1,{LONGEST_NAME}}}")
+"""Names that are allowed in paths, except `RESERVED`."""
+RESERVED = re.compile(r"con|prn|aux|nul|(com|lpt)\d", re.IGNORECASE)
+"""Names that Windows reserves for devices."""
 LEFTOVER = re.compile(r"\.(?P<machine>\w+)-(?P<process>\d{1,18})\.building(\.\w+)?$")
 """Suffix of incomplete files."""
 CHECKSUM = "checksum"
@@ -120,6 +124,20 @@ def check_inside(folder: Path, path: Path, remedy: str) -> None:
     """
     if not path.resolve().is_relative_to(folder.resolve()):
         raise DamagedFileError(path, f"is a link to a place outside of {folder}", remedy)
+
+
+def is_name(text: str) -> bool:
+    """Whether a text from a file may be a part of a path."""
+    return bool(NAME.fullmatch(text) and not RESERVED.fullmatch(text))
+
+
+def file_name(text: str) -> str:
+    """Name of a file from any text, "" for one without letters: long texts are cut and end with their hash."""
+    name = re.sub(r"\W+", "_", text).strip("_").lower()
+    if len(name.encode()) > LONGEST_NAME:
+        digest = hashlib.sha256(text.encode()).hexdigest()[:16]
+        name = f"{name.encode()[: LONGEST_NAME - 17].decode(errors='ignore')}_{digest}"
+    return f"{name}_" if RESERVED.fullmatch(name) else name
 
 
 def output_path(folder: Path, name: str, out: str | Path | None = None) -> Path:

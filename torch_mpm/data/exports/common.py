@@ -70,18 +70,29 @@ class Export:
             yield ExportedScene(number, position, kind, stored)
 
 
-def fields_of(scene: ExportedScene, names: Sequence[str]) -> dict[str, Array]:
+def fields_of(scene: ExportedScene, names: Sequence[str], own: Sequence[str] = ()) -> dict[str, Array]:
     """Further arrays of a scene, [T, N, ...] or [N]; stresses have their measure in their name.
 
+    Args:
+        scene: the scene.
+        names: names of its arrays.
+        own: names that the format gives to its own arrays.
+
     Raises:
-        DatasetError: for a missing array.
+        DatasetError: for an array that is missing, or whose name in the export is that of another one.
     """
-    for name in names:
-        if name not in scene.arrays:
-            known = ", ".join(n for n in scene.arrays.names if n not in ("position", "particle_type"))
-            raise DatasetError(f"fields must be of {known}, got {name!r}, which scene {scene.id} does not have")
-    measures = scene.arrays.measures
-    return {explicit_name(name, measures.get(name, "")): scene.arrays[name] for name in names}
+    measures, always = scene.arrays.measures, ("position", "particle_type")
+    found: dict[str, Array] = {}
+    for name in dict.fromkeys(names):
+        if name in always or name not in scene.arrays:
+            known = ", ".join(n for n in scene.arrays.names if n not in always)
+            problem = "every export has" if name in always else f"scene {scene.id} does not have"
+            raise DatasetError(f"fields must be of {known}, got {name!r}, which {problem}")
+        written = explicit_name(name, measures.get(name, ""))
+        if written in (*own, *found):
+            raise DatasetError(f"fields: {name!r} would be written as {written!r}, a name of another array")
+        found[written] = scene.arrays[name]
+    return found
 
 
 def exported_ids(dataset: DatasetFolder, split: str) -> list[int]:

@@ -32,7 +32,7 @@ def export_lagrangebench(
         fields: further arrays of the scenes to write beside the positions, such as "stress", which is written as
             ``cauchy_stress``; its loader skips them.
 
-    Returns and errors as :func:`export_gns`; DatasetError also for a missing field.
+    Returns and errors as :func:`export_gns`; DatasetError also for a field that is missing or written twice.
     """
     codes: dict[int, int] = {}
     with exporting(dataset, out, "lagrangebench", more=lambda dataset: _words(dataset, codes)) as export:

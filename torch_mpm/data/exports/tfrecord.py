@@ -44,8 +44,8 @@ def export_tfrecord(
         context: whether every frame has ``step_context`` (float32 bytes), the gravity [D] of the scene; metadata.json
             then has ``context_mean`` and ``context_std``, by which DeepMind's reader detects it.
 
-    Returns and errors as :func:`export_gns`; DatasetError also for a missing field; ImportError without google-crc32c
-    (extra ``data``).
+    Returns and errors as :func:`export_gns`; DatasetError also for a field that is missing or written twice;
+    ImportError without google-crc32c (extra ``data``).
     """
     checksum = _crc32c()
     more: dict[str, Any] = {"more": _context_statistics} if context else {}
@@ -77,7 +77,7 @@ def _context_statistics(dataset: DatasetFolder) -> dict[str, list[float]]:
 
 def _frames(scene: ExportedScene, fields: Sequence[str], context: Array | None) -> dict[str, Array]:
     """Features of every frame, by name: arrays [T, ...]."""
-    more = fields_of(scene, fields)
+    more = fields_of(scene, fields, ("step_context",))
     if flat := [name for name, values in more.items() if len(values.shape) < 2]:
         raise DatasetError(f"fields must be arrays [T, N, ...], got {flat[0]!r}")
     steps = {} if context is None else {"step_context": np.tile(context, (len(scene.position), 1))}

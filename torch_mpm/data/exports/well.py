@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from ..hdf5 import h5py_module, new_file
 from ..obstacle_fields import obstacle_mask, obstacles_of
 from ..rasterise import cell_centres, rasterise
 from ..statistics import Sums
-from ..whole_files import write_whole
+from ..whole_files import file_name, write_whole
 from .common import Array, Export, ExportedScene, exported_ids, exporting
 
 AXES = ("x", "y", "z")
@@ -42,7 +41,7 @@ def export_well(dataset: str | Path | DatasetFolder, out: str | Path | None = No
         side = min(b - a for a, b in zip(record.lower, record.upper, strict=True))
         if dx is not None and dx > side:
             raise DatasetError(f"dx must be at most {side:g}, the shortest side of the domain, got {dx:g}")
-        name = re.sub(r"\W+", "_", record.title).strip("_").lower() or "torch_mpm"
+        name = file_name(record.title) or "torch_mpm"
         scalars = {scene.id: _scalars(export, scene.id) for scene in export.dataset.scenes()}
         shared = set.intersection(*map(set, scalars.values()))
         kept = {number: {n: v for n, v in values.items() if n in shared} for number, values in scalars.items()}
