@@ -145,6 +145,8 @@ def test_flipped_bits_are_not_read(tmp_path, layout, reads):
     data = file.read_bytes()
     with h5py.File(file) as read:
         counter = read["frames_written"].id.get_offset()
+    with Trajectory(tmp_path) as read:
+        described = read.attributes, read.measures
     exports = {"ply": export_ply, "vtk": export_vtk}
     for place in [counter, *range(0, len(data), len(data) // (150 if reads in ("arrays", "frames") else 12))]:
         file.write_bytes(data[:place] + bytes([data[place] ^ 4]) + data[place + 1 :])
@@ -154,6 +156,7 @@ def test_flipped_bits_are_not_read(tmp_path, layout, reads):
                 continue
             with Trajectory(tmp_path) as read:
                 assert len(read) == FRAMES
+                assert (read.attributes, read.measures) == described
                 arrays = [{name: read[name][k] for name in read.columns} for k in range(FRAMES)]
                 for k, got in enumerate(arrays if reads == "arrays" else read):
                     for name, value in frame(k).items():

@@ -53,18 +53,19 @@ def _check_files(dataset: DatasetFolder) -> None:
     """Check the list of finished shards, without reading them.
 
     Raises:
-        DamagedFileError: for a shard that is missing, of another size, of other scenes, or superfluous.
+        DamagedFileError: for a shard that is missing, of another size, or superfluous.
     """
-    record = dataset.record
-    for index in dataset.finished:
+    for index in finished_shards(dataset.path):
         path = shard_path(dataset.path, index)
+        if index >= dataset.record.shards:
+            raise _superfluous(path, dataset.record)
         told = ShardRecord.read(record_path(path))
-        if index >= record.shards:
-            raise DamagedFileError(path, f"is beyond the {record.shards} shards of the data set", REMEDY)
         if not path.is_file() or path.stat().st_size != told.bytes:
             raise DamagedFileError(path, "is gone, or not as long as its record says", REMEDY)
-        if [scene.id for scene in told.scenes] != record.ids(index):
-            raise DamagedFileError(path, "has other scenes than those of its number", REMEDY)
+
+
+def _superfluous(path: Path, record: DatasetRecord) -> DamagedFileError:
+    return DamagedFileError(path, f"is beyond the {record.shards} shards of the data set", "remove it and its .json")
 
 
 def verify(folder: str | Path) -> Iterator[str]:
@@ -76,13 +77,15 @@ def verify(folder: str | Path) -> Iterator[str]:
     Raises:
         FileNotFoundError, DamagedFileError: for a folder without a readable ``dataset.json``.
     """
-    record, finished = DatasetRecord.read(Path(folder)), finished_shards(Path(folder))
+    finished = finished_shards(Path(folder))  # Before the record, which is extended before shards are added.
+    record = DatasetRecord.read(Path(folder))
     if missing := record.missing(finished):
         yield f"{folder}: {missing} are not there or not finished; generate them"
     for index in finished:
-        if index >= record.shards:
-            continue
         path = shard_path(Path(folder), index)
+        if index >= record.shards:
+            yield str(_superfluous(path, record))
+            continue
         try:
             with Shard(path, check=True) as shard:
                 yield from _shard_problems(shard, record, index)
@@ -90,6 +93,8 @@ def verify(folder: str | Path) -> Iterator[str]:
             yield f"{path}: is not there; generate again"
         except DamagedFileError as error:
             yield f"{error} (--check does so for all damaged shards)"
+        except OSError as error:  # Such as a pipe, or a file of another user.
+            yield str(error)
 
 
 def _shard_problems(shard: Shard, record: DatasetRecord, index: int) -> Iterator[str]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import itertools
 import json
-import math
 import os
 import re
 from collections import OrderedDict
@@ -17,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import DamagedFileError
+from ..grid.grid import MOST_NODES
 from .shard import REMEDY, Array, SceneRecord, Shard, ShardRecord, StoredScene, record_path, scene_name, shard_path
 from .statistics import Motion, Sums
 from .whole_files import check_inside, check_record, count, is_name, write_record
@@ -29,6 +29,8 @@ MOST_SHARDS = 10**6
 """Limits of a data set, and of the scenes of a shard."""
 MOST_OPEN = 32
 """Number of shards, and of their scenes, that a reader keeps open."""
+SMALLEST, LARGEST = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)
+"""Numbers within which float32 has all its digits."""
 
 
 LINKED = "copy what it links to into the folder, or link the folder as a whole"
@@ -98,6 +100,25 @@ class DatasetRecord:
         """Ids of the scenes of a shard."""
         begin, end = shard * self.scenes_per_shard, (shard + 1) * self.scenes_per_shard
         return [k for _, first, count in self.ranges for k in range(max(first, begin), min(first + count, end))]
+
+    def problem(self) -> str:
+        """Problem of its domain, of the number of nodes along an axis or of the times of frames; "" for none.
+
+        Lengths and times must be finite in float32, and their reciprocals too.
+        """
+        if not 2 <= len(self.lower) == len(self.upper) <= 3:
+            return f"lower and upper must have 2 or 3 numbers, got {self.lower} and {self.upper}"
+        sides = [b - a for a, b in zip(self.lower, self.upper, strict=True)]
+        if not all(abs(x) <= LARGEST for x in (*self.lower, *self.upper)) or not min(sides) > 0:
+            return f"upper must be above lower, and finite in float32, got {self.lower} and {self.upper}"
+        ranges = {
+            "dx": (max(SMALLEST, max(sides) / MOST_NODES), LARGEST),
+            "frame_interval": (SMALLEST, LARGEST / self.frames),
+        }
+        for name, (least, most) in ranges.items():
+            if not least <= (value := getattr(self, name)) <= most:
+                return f"{name} must be within {least:.3g} and {most:.3g}, got {value:g}"
+        return ""
 
     def missing(self, finished: Sequence[int]) -> str:
         """Missing shards in words; "" for none."""
@@ -183,14 +204,10 @@ class DatasetRecord:
             words["splits"] = {str(n): (count(first), count(of)) for n, (first, of) in words["splits"].items()}
             words["added"] = tuple((str(n), count(first), count(of)) for n, first, of in words.get("added", ()))
             record = cls(**words)
-            sizes = [
-                record.dx,
-                record.frame_interval,
-                *(b - a for a, b in zip(record.lower, record.upper, strict=True)),
-            ]
-            few = max(record.shards, record.scenes_per_shard) <= MOST_SHARDS
-            if not (few and 2 <= record.dim <= 3 and all(0 < size < math.inf for size in sizes)):
+            if max(record.shards, record.scenes_per_shard) > MOST_SHARDS:
                 raise ValueError("its numbers make no sense")
+            if problem := record.problem():
+                raise ValueError(problem)
             if wrong := [n for n in (*record.splits, *record.fields) if not is_name(n)]:
                 raise ValueError(f"{wrong[0]!r:.100} is no name of a split or a field")
             ends = [0, *(first + count for _, first, count in record.ranges)]
@@ -204,16 +221,16 @@ class DatasetRecord:
 
 
 def finished_shards(folder: Path) -> list[int]:
-    """Numbers of the shards of a folder that have a record."""
+    """Numbers of the shards of a folder that have a record, including those that the data set does not have."""
     names = (path.name for path in (folder / "shards").glob("shard_*.json"))
-    return sorted(int(match[1]) for name in names if (match := re.fullmatch(r"shard_(\d{5,9})\.json", name)))
+    return sorted(int(match[1]) for name in names if (match := re.fullmatch(r"shard_(\d{5}|[1-9]\d{5,8})\.json", name)))
 
 
 class DatasetFolder:
     """A data set on disk, finished or still growing: ``DatasetFolder("out/sand")``.
 
-    Failed scenes and unfinished shards are invisible. Files are opened when they are read, separately in each process,
-    so that the object can be copied to the workers of a data loader.
+    Failed scenes, unfinished shards and shards beyond those of ``dataset.json`` are invisible. Files are opened when
+    they are read, separately in each process, so that the object can be copied to the workers of a data loader.
 
     Raises:
         FileNotFoundError: for a folder without a data set.
@@ -224,7 +241,7 @@ class DatasetFolder:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self.record = DatasetRecord.read(self.path)
-        self.finished = finished_shards(self.path)
+        self.finished = [k for k in finished_shards(self.path) if k < self.record.shards]
         self._scenes = {s.id: (k, s) for k in self.finished for s in self._record(k).scenes}
         self._cache = _OpenFiles()
 
@@ -233,6 +250,8 @@ class DatasetFolder:
         record = ShardRecord.read(path)
         if any(len(s.motion.velocity.sum) != self.record.dim for s in record.scenes if s.motion):
             raise DamagedFileError(path, f"has sums of another number of dimensions than {self.record.dim}", REMEDY)
+        if [scene.id for scene in record.scenes] != self.record.ids(shard):
+            raise DamagedFileError(path, "has other scenes than those of its number", REMEDY)
         return record
 
     def _shard_path(self, shard: int) -> Path:
@@ -269,13 +288,13 @@ class DatasetFolder:
         zero = Motion(Sums.zero(self.record.dim), Sums.zero(self.record.dim))
         return functools.reduce(lambda a, b: a + b, (s.motion for s in self.scenes(split) if s.motion), zero)
 
-    def check(self) -> None:
-        """Compare all finished shards with their checksums.
+    def check(self, scenes: Sequence[int] | None = None) -> None:
+        """Compare the finished shards with their checksums, all of them or those of finished scenes.
 
         Raises:
             DamagedFileError: for a shard that was changed.
         """
-        for index in self.finished:
+        for index in self.finished if scenes is None else sorted({self._scenes[k][0] for k in scenes}):
             Shard(self._shard_path(index), check=True).close()
 
     def close(self) -> None:

@@ -124,9 +124,13 @@ def _told_once(found: Mapping[str, Sequence[str]]) -> list[str]:
 
 
 def record_of(configuration: Configuration, device: torch.device) -> DatasetRecord:
-    """Record of a data set for dataset.json."""
+    """Record of a data set for dataset.json.
+
+    Raises:
+        SceneError: for numbers that no reader accepts.
+    """
     dataset, grid = configuration.dataset, configuration.words["grid"]
-    return DatasetRecord(
+    record = DatasetRecord(
         configuration=configuration.hash,
         seed=dataset.seed,
         splits=configuration.splits,
@@ -141,6 +145,9 @@ def record_of(configuration: Configuration, device: torch.device) -> DatasetReco
         device=device.type,
         versions={**versions(), "numpy": np.__version__},
     )
+    if problem := record.problem():
+        raise SceneError([f"dataset: {problem}"], configuration.source)
+    return record
 
 
 class _Line:

@@ -197,16 +197,21 @@ class SparseFile(_File):
 # ---- seals
 
 
-def seal(handle: BinaryIO, extents: Extents) -> None:
-    """Append the seal of these parts to a file that is open for reading and writing."""
+def seal(handle: BinaryIO, extents: Extents) -> str:
+    """Append the seal of these parts to a file that is open for reading and writing; returns its SHA-256."""
     text = json.dumps([list(part) for part in extents]).encode()
     digest = _digest(handle, extents, text)
     handle.seek(0, os.SEEK_END)
     handle.write(text + FOOTER.pack(len(text), digest, MAGIC))
+    return digest.hex()
 
 
-def check_seal(path: Path, remedy: str) -> None:
-    """Raise DamagedFileError with ``remedy`` unless the parts under the seal of a file are as they were written."""
+def check_seal(path: Path, remedy: str) -> str:
+    """Compare the parts under the seal of a file with its SHA-256, which is returned.
+
+    Raises:
+        DamagedFileError: with ``remedy``, where they differ.
+    """
     check_file(path, "HDF5", largest=None, may_be_empty=True)
     with open(path, "rb") as handle:
         size = handle.seek(0, os.SEEK_END)
@@ -225,6 +230,16 @@ def check_seal(path: Path, remedy: str) -> None:
         inside = all(0 <= offset <= offset + count <= end for offset, count in extents)
         if not inside or sum(count for _, count in extents) > end or _digest(handle, extents, text) != digest:
             raise DamagedFileError(path, "is damaged: its checksum is wrong", remedy)
+        return digest.hex()
+
+
+def outside(extents: Extents, size: int) -> list[tuple[int, int]]:
+    """Parts of a file of ``size`` bytes outside of other parts, in order."""
+    begins, ends = [], [0]
+    for offset, length in sorted(extents):
+        begins.append(offset)
+        ends.append(max(ends[-1], offset + length))
+    return [(end, begin - end) for end, begin in zip(ends, [*begins, size], strict=True) if begin > end]
 
 
 def _digest(handle: BinaryIO, extents: Extents, text: bytes) -> bytes:

@@ -37,7 +37,7 @@ def available() -> float:
 
 def in_words(size: float) -> str:
     """A number of bytes with its unit."""
-    power = min(int(math.log10(max(size, 1)) / 3), 3)
+    power = int(min(math.log10(max(size, 1)) / 3, 3))
     return f"{size / 1000**power:.3g} {('bytes', 'kB', 'MB', 'GB')[power]}"
 
 

@@ -7,6 +7,9 @@ Layout: one group ``scene_0000000`` per scene, by its id in the data set. ``posi
 every frame are compressed in chunks of some frames, so that a window of frames is read without the rest. Arrays of one
 dimension, such as ``particle_type`` [N], are stored as they are. Stresses have an attribute ``measure``, "Cauchy" or
 "Kirchhoff" (without it, ``stress`` is the Kirchhoff stress). A scene that failed has attributes and no arrays.
+
+A seal (:mod:`torch_mpm.data.hdf5`) protects all but the numbers of arrays, and is checked before HDF5 reads the file.
+Chunks have the Adler-32 of zlib, arrays of one dimension a digest in the record.
 """
 
 from __future__ import annotations
@@ -25,7 +28,7 @@ import numpy.typing as npt
 
 from ..errors import DamagedFileError, is_finite
 from ..files import check_file
-from .hdf5 import READ_ERRORS, h5py_module, storage_problem, unreadable
+from .hdf5 import READ_ERRORS, check_seal, h5py_module, storage_problem, unreadable
 from .packing import array_digest
 from .statistics import Motion, Sums
 from .stress import MEASURES, measure_of
@@ -37,6 +40,8 @@ FORMAT = 3
 FORMAT_WITHOUT_CHECKSUM = 2
 """Format of records that were written before records had checksums."""
 REMEDY = "remove it and its .json, and generate again"
+MOST_CHECKED = 2**16
+"""Number of files whose check a process remembers."""
 
 
 def shard_path(folder: str | Path, index: int) -> Path:
@@ -89,11 +94,15 @@ class SceneRecord:
 
 @dataclass(frozen=True)
 class ShardRecord:
-    """Record of a shard: the size [bytes] and the `file_hash` of its file, and its scenes."""
+    """Record of a shard: the size [bytes] and the `file_hash` of its file, its scenes, and the SHA-256 of its seal.
+
+    ``seal`` is "" for shards that were written before shards had seals.
+    """
 
     bytes: int
     sha256: str
     scenes: list[SceneRecord]
+    seal: str = ""
 
     def write(self, path: Path) -> None:
         """Write the record to a file, which appears when it is complete and on the disk."""
@@ -115,7 +124,7 @@ class ShardRecord:
             if words["format"] == FORMAT:
                 check_record(words, path, REMEDY)
             scenes = [SceneRecord.of(s) for s in words["scenes"]]
-            record = cls(count(words["bytes"]), str(words["sha256"]), scenes)
+            record = cls(count(words["bytes"]), str(words["sha256"]), scenes, str(words.get("seal", "")))
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError) as error:
             if isinstance(error, DamagedFileError):
                 raise
@@ -191,7 +200,11 @@ class StoredScene:
     @property
     def measures(self) -> dict[str, str]:
         """Measure of each stress, "Cauchy" or "Kirchhoff"; the latter for "stress" without the attribute `measure`."""
-        return {name: measure_of(name, self._measure(name)) for name in self.names if name in MEASURES}
+        stored = {name: self._measure(name) for name in self.names if name in MEASURES}
+        try:
+            return {name: measure_of(name, measure) for name, measure in stored.items()}
+        except ValueError as error:
+            raise DamagedFileError(self.path, f"{self._name}/{error}", REMEDY) from None
 
     def _measure(self, name: str) -> Any:
         try:
@@ -238,11 +251,13 @@ class Shard:
 
     Args:
         path: the .h5 file.
-        check: compare the whole file with its record first, which reads all of it; otherwise only its size is compared,
-            and damage to compressed arrays is detected when they are read.
+        check: compare the whole file with its record first, which reads all of it; otherwise its size and all but the
+            numbers of its arrays are compared, once per process, and damage to the numbers is detected when they are
+            read. Shards without a seal, of older versions, are compared as a whole, once per process.
 
     Raises:
         FileNotFoundError: for a missing or unfinished shard.
+        OSError: for a file that cannot be read, or is a pipe, a device or a folder.
         DamagedFileError: for a file that is not a shard or is damaged; later, where damaged scenes are read.
         ImportError: when h5py is missing (extra ``data``).
     """
@@ -251,10 +266,15 @@ class Shard:
         h5py = h5py_module()
         self.path = Path(path)
         self.record = ShardRecord.read(record_path(self.path))
-        if self.path.stat().st_size != self.record.bytes:
+        check_file(self.path, "shard", largest=None, may_be_empty=True)
+        status = self.path.stat()
+        if status.st_size != self.record.bytes:
             raise DamagedFileError(self.path, "is not as long as its record says", REMEDY)
-        if check and not self._intact():
-            raise DamagedFileError(self.path, "is damaged: its checksum is wrong", REMEDY)
+        if check:
+            _check_whole(self.path, self.record.sha256)
+        else:
+            state = (status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns)
+            _check_once(self.path, self.record.sha256, self.record.seal, state)
         try:
             self._file = h5py.File(self.path, "r")
         except READ_ERRORS as error:
@@ -301,6 +321,26 @@ class Shard:
 
     def __iter__(self) -> Iterator[StoredScene]:
         return (self.scene(scene_id) for scene_id in self.ids)
+
+
+@functools.lru_cache(MOST_CHECKED)
+def _check_once(path: Path, sha256: str, sealed: str, state: tuple[int, ...]) -> None:
+    """Compare a file with its record before HDF5 reads it, which may hang on damaged bytes.
+
+    The cache stores the files that were as recorded; a changed ``state`` of a file is another entry.
+
+    Raises:
+        DamagedFileError: for a file that was changed.
+    """
+    if not sealed:
+        _check_whole(path, sha256)
+    elif check_seal(path, REMEDY) != sealed:
+        raise DamagedFileError(path, "is another shard than that of its record", REMEDY)
+
+
+def _check_whole(path: Path, sha256: str) -> None:
+    if file_hash(path) != sha256:
+        raise DamagedFileError(path, "is damaged: its checksum is wrong", REMEDY)
 
 
 STORED = ("<f4", "<f8", "|i1", "|u1", "<i2", "<i4", "<i8")

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from .hdf5 import QuietFile, h5py_module
+from .hdf5 import QuietFile, h5py_module, outside, seal
 from .packing import GZIP_LEVEL, Array, Compressed, PreparedScene
 from .shard import FORMAT, SceneRecord, ShardRecord, record_path, scene_name
 from .stress import MEASURES
@@ -40,6 +40,7 @@ class ShardWriter:
         self._file = h5py.File(self._disk, "w", libver="v110")
         self._file.attrs.update({"format": FORMAT, **(attributes or {})})
         self._scenes: list[SceneRecord] = []
+        self._numbers: list[tuple[int, int]] = []
 
     def __enter__(self) -> ShardWriter:
         return self
@@ -69,9 +70,9 @@ class ShardWriter:
             _write_attribute(group, name, value)
         for name, values in scene.arrays.items():
             if isinstance(values, Compressed):
-                _write_chunks(group, name, values)
+                self._numbers += _write_chunks(group, name, values)
             else:
-                _write_array(group, name, values)
+                self._numbers += _write_array(group, name, values)
         self._disk.check()
         record = SceneRecord(
             scene_id,
@@ -88,16 +89,22 @@ class ShardWriter:
     def finish(self) -> ShardRecord:
         """Write the rest of the shard and then its record; each appears when it is complete and on the disk.
 
+        A seal protects all but the numbers of the arrays, each of which has a checksum, so that a reader detects damage
+        before HDF5 meets it, without reading the whole shard.
+
         Raises:
             OSError: for a full disk, among others.
         """
         self._file.close()
+        self._disk.check()
+        with open(self._building, "r+b") as handle:
+            sealed = seal(handle, outside(self._numbers, self._disk.size))
         with ThreadPoolExecutor(1) as beside:  # A disk and a hash take about as long.
             digest = beside.submit(file_hash, self._building)
             self._disk.sync()
         appear(self._building, self._path)
         scenes = sorted(self._scenes, key=lambda scene: scene.id)
-        record = ShardRecord(self._path.stat().st_size, digest.result(), scenes)
+        record = ShardRecord(self._path.stat().st_size, digest.result(), scenes, sealed)
         record.write(record_path(self._path))
         return record
 
@@ -120,17 +127,22 @@ def _write_attribute(group: Any, name: str, value: str | int | float) -> None:
     attribute.write(np.array(value, kind), mtype=h5py.h5t.py_create(kind))
 
 
-def _write_array(group: Any, name: str, values: Array) -> None:
+def _write_array(group: Any, name: str, values: Array) -> list[tuple[int, int]]:
+    """Write an array; returns the offset and the length of its numbers in the file [bytes]."""
     values = np.ascontiguousarray(values)
     data = _new_dataset(group, name, values.shape, values.dtype)
     data.write(h5py_module().h5s.ALL, h5py_module().h5s.ALL, values)
+    return [(data.get_offset(), values.nbytes)] if values.nbytes else []
 
 
-def _write_chunks(group: Any, name: str, values: Compressed) -> None:
+def _write_chunks(group: Any, name: str, values: Compressed) -> list[tuple[int, int]]:
+    """Write a compressed array; returns the offset and the length of each chunk in the file [bytes]."""
     chunk = (values.chunk_frames, *values.shape[1:])
     data = _new_dataset(group, name, values.shape, values.dtype, chunk)
     for k, packed in enumerate(values.chunks):
         data.write_direct_chunk((k * values.chunk_frames, *(0,) * (len(chunk) - 1)), packed)
+    stored = map(data.get_chunk_info, range(len(values.chunks)))
+    return [(info.byte_offset, info.size) for info in stored]
 
 
 def _new_dataset(

@@ -20,8 +20,17 @@ TENSORS = ("stress", "cauchy_stress", "kirchhoff_stress")
 
 
 def measure_of(name: str, attribute: Any) -> str:
-    """Measure of an array of a file: its attribute, or that of older files without it."""
-    return str(attribute) if attribute is not None else KIRCHHOFF if name == "stress" else MEASURES[name]
+    """Measure of an array of a file: its attribute, or that of older files without it.
+
+    Raises:
+        ValueError: for an attribute that is no measure, or not that of the field.
+    """
+    if attribute is None:
+        return KIRCHHOFF if name == "stress" else MEASURES[name]
+    known = (CAUCHY, KIRCHHOFF) if name == "stress" else (MEASURES[name],)
+    if not isinstance(attribute, str) or attribute not in known:
+        raise ValueError(f"{name} must have the measure {' or '.join(known)}, got {attribute!r:.100}")
+    return attribute
 
 
 def explicit_name(name: str, measure: str) -> str:

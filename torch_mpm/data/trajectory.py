@@ -291,7 +291,10 @@ class Trajectory:
     def measures(self) -> dict[str, str]:
         """Measure of each stress, "Cauchy" or "Kirchhoff"; the latter for "stress" without the attribute `measure`."""
         stresses = [name for name in self.fields if name in MEASURES]
-        return {name: measure_of(name, self.file[name].attrs.get("measure")) for name in stresses}
+        try:
+            return {name: measure_of(name, self.file[name].attrs.get("measure")) for name in stresses}
+        except ValueError as error:
+            raise DamagedFileError(self.path, str(error), self._remedy) from None
 
     def frame(self, k: int) -> dict[str, Array]:
         """All of frame ``k``: the fields and constants of its particles, and its scalars."""

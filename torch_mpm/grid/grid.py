@@ -28,6 +28,8 @@ from . import resolution
 from .topology import BLOCK_WIDTH, PADDING, Lattice, Status, Topology
 
 INT32_MAX = 2**31 - 1
+MOST_NODES = 2**33
+"""Number of nodes along an axis beyond which no grid can have fewer than 2^31 blocks."""
 STATUS_SIZE = 8
 """Numbers per row of a status, csrc/grid/status.h."""
 KERNEL_ORDERS = {"quadratic": 2, "cubic": 3}

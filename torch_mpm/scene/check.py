@@ -19,14 +19,12 @@ from ..data import host_memory
 from ..files import check_file
 from ..geometry import seed
 from ..grid import resolution
-from ..grid.grid import Grid
+from ..grid.grid import MOST_NODES, Grid
 from . import heat, schema
 from .places import obstacle, region, relative
 
 PARTICLE_BYTES = 400
 """Minimum memory per particle while a scene is built and simulated."""
-NODES = 2**33
-"""Number of nodes along an axis beyond which no grid can have fewer than 2^31 blocks."""
 FRAMES = 10**8
 PIXELS = range(16, 16385)
 
@@ -106,7 +104,7 @@ def corner_problems(grid: schema.Grid) -> Iterator[str]:
     if any(a >= b for a, b in zip(grid.lower, grid.upper, strict=False)):
         yield f"grid.upper: must be above grid.lower on every axis, got {grid.upper}"
     nodes = [(b - a) / grid.dx for a, b in zip(grid.lower, grid.upper, strict=False)]
-    if max(nodes) > NODES:
+    if max(nodes) > MOST_NODES:
         yield f"grid.dx: the domain has {max(nodes):.2g} nodes along an axis; make dx larger or the domain smaller"
 
 

@@ -120,8 +120,8 @@ def exporting(
     """
     dataset = source if isinstance(source, DatasetFolder) else DatasetFolder(source)
     target = output_path(dataset.path, name, out)
-    words = metadata(dataset, material=material)
     dataset.check()
+    words = metadata(dataset, material=material)
     with new_folder(target) as folder:
         _require_room(dataset, folder)
         yield Export(dataset, folder, target)

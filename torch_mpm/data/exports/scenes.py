@@ -31,7 +31,7 @@ def export_scenes_vtk(
     Raises:
         FileExistsError: when ``out`` exists already.
         KeyError: for a scene that does not exist, failed, or is not finished.
-        DamagedFileError: for a scene that is damaged.
+        DamagedFileError: for a shard of these scenes that is damaged: its checksum is verified first.
         ImportError: when meshio is missing (extra ``data``).
     """
     return _export(dataset, out, scenes, "vtk", lambda scene, frames, path: write_vtk(frames, path, scene.measures))
@@ -55,6 +55,7 @@ def _export(
     target = output_path(dataset.path, name, out)
     chosen = [scene.id for scene in dataset.scenes()[:1]] if scenes is None else scenes
     stored = {number: dataset.scene(number) for number in chosen}
+    dataset.check(chosen)
     with new_folder(target) as folder:
         for number, scene in stored.items():
             (folder / scene_name(number)).mkdir()

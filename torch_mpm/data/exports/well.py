@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..folder import DatasetError, DatasetFolder, velocity_of
+from .. import host_memory
+from ..folder import DatasetError, DatasetFolder, DatasetRecord, velocity_of
 from ..hdf5 import h5py_module, new_file
 from ..obstacle_fields import obstacle_mask, obstacles_of
 from ..rasterise import cell_centres, rasterise
@@ -41,6 +42,7 @@ def export_well(dataset: str | Path | DatasetFolder, out: str | Path | None = No
         side = min(b - a for a, b in zip(record.lower, record.upper, strict=True))
         if dx is not None and dx > side:
             raise DatasetError(f"dx must be at most {side:g}, the shortest side of the domain, got {dx:g}")
+        _require_memory(record, dx or 2 * record.dx)
         name = file_name(record.title) or "torch_mpm"
         scalars = {scene.id: _scalars(export, scene.id) for scene in export.dataset.scenes()}
         shared = set.intersection(*map(set, scalars.values()))
@@ -54,6 +56,12 @@ def export_well(dataset: str | Path | DatasetFolder, out: str | Path | None = No
         chosen = statistics.get("train") or next(iter(statistics.values()))
         write_whole(export.folder / "stats.yaml", json.dumps(chosen.words(), indent=1).encode())  # JSON is valid YAML.
     return export.target
+
+
+def _require_memory(record: DatasetRecord, dx: float) -> None:
+    """Raise MemoryError where the fields of a scene do not fit into the memory."""
+    cells = math.prod((b - a) / dx for a, b in zip(record.lower, record.upper, strict=True))
+    host_memory.require(4 * cells * record.frames * (1 + record.dim), f"a scene in {cells:.3g} cells of {dx:g} m")
 
 
 class _Statistics:
