@@ -199,9 +199,10 @@ def _run(options: argparse.Namespace) -> None:
     _require_outputs(scene)
     complete = options.resume and finished(options.out, scene.fingerprint()) is not None
     bar = None if options.quiet else _Bar()
+    notice = None if bar is None else bar.notice
     source = options.scene.read_text(encoding="utf-8")
     try:
-        summary = run(scene, options.out, resume=options.resume, source=source, progress=bar)
+        summary = run(scene, options.out, resume=options.resume, source=source, progress=bar, notice=notice)
     except (SceneFailure, Interrupted):
         if bar is not None:
             bar.close()
@@ -366,6 +367,10 @@ class _Bar:
             refresh=False,
         )
         self._bar.update()
+
+    def notice(self, line: str) -> None:
+        """Print a line above the bar."""
+        self._make.write(f"torch-mpm: {line}", file=sys.stderr)
 
     def close(self) -> None:
         if self._bar is not None:

@@ -1,5 +1,7 @@
 """Scenes that would never end are refused before the first substep, by the key that makes them so."""
 
+import re
+
 import pytest
 from helpers import FILE, scene_command
 
@@ -8,6 +10,7 @@ pytest.importorskip("h5py")
 
 from torch_mpm.cli import main
 from torch_mpm.scene import Scene, SceneError
+from torch_mpm.scene import run as module
 
 
 @pytest.mark.parametrize("command", ["check", "run"])
@@ -33,6 +36,28 @@ def test_the_number_of_substeps_is_told(tmp_path, capsys):
     scene.write_text(FILE.format(duration=0.04))
     assert main(["check", str(scene), "--set", "dt=1e-5"]) == 0
     assert "about 4000 substeps" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("quiet", [False, True])
+@pytest.mark.parametrize("runs", ["long", "short"])
+def test_a_long_run_gives_notice_of_the_substeps_left(runs, quiet, tmp_path, capsys, monkeypatch):
+    """At the start, and again while no frame is complete; the numbers are those of the run."""
+    if runs == "long":
+        monkeypatch.setattr(module, "LONG_RUN", 200)
+        monkeypatch.setattr(module, "BETWEEN_NOTICES", 0.0)
+    words = scene_command(tmp_path, "run", "dt=1e-4")
+    assert main(words if quiet else [word for word in words if word != "--quiet"]) == 0
+    lines = [line for line in capsys.readouterr().err.splitlines() if "substeps of" in line]
+    if quiet or runs == "short":
+        assert not lines
+        return
+    found = [re.search(r"frame 0 of 2, t = (.*) s: about (.*) substeps of 0.0001 s are left", line) for line in lines]
+    left = [(float(a[1]), float(a[2])) for a in found if a is not None]
+    assert (
+        len(left) >= 2 and left[0][0] == pytest.approx(32e-4, rel=0.02) and "until 0.04 s, which take some" in lines[0]
+    )
+    for time, substeps in left:
+        assert substeps == pytest.approx((0.04 - time) / 1e-4, rel=0.05) and substeps >= 200
 
 
 @pytest.mark.parametrize("together", [False, True])

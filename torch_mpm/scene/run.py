@@ -47,7 +47,13 @@ LIMITS = 8
 oscillating particles (docs/limitations.md).
 """
 
+LONG_RUN = 10**6
+"""Number of substeps from which a run gives notice of those that are left."""
+BETWEEN_NOTICES = 60.0
+"""Time without a frame after which it does so again [s]."""
+
 Progress = Callable[[dict[str, Any]], None]
+Notice = Callable[[str], None]
 
 
 class Interrupted(RuntimeError):
@@ -74,6 +80,7 @@ def run(
     resume: bool = False,
     source: str = "",
     progress: Progress | None = None,
+    notice: Notice | None = None,
 ) -> dict[str, Any]:
     """Simulate ``scene`` into the folder ``out``: trajectory, checkpoint, summary.
 
@@ -84,6 +91,8 @@ def run(
             where a kill prevented its writing.
         source: text of the scene file, stored in the trajectory; the words of the scene by default.
         progress: called after each frame with a dictionary of its numbers.
+        notice: called with a line about the substeps and the time that are left, at the start of a run of more than
+            `LONG_RUN` substeps and after each `BETWEEN_NOTICES` without a frame.
 
     Returns:
         The summary, also in ``run.json``.
@@ -106,7 +115,7 @@ def run(
         claim(folder, fingerprint, resume)
     built = scene.build()
     check_substeps(scene, built)
-    simulation = Simulation(scene, built)
+    simulation = Simulation(scene, built, notice)
     layout = simulation.layout(source, fingerprint)
     with StopSignals() as stop, prompt_turns(), output_errors(folder), locked(folder), torch.no_grad():
         claim(folder, fingerprint, resume)  # Again: another process may have worked here before the lock.
@@ -167,8 +176,11 @@ class Moved(NamedTuple):
 class Simulation:
     """Loop over frames. All its decisions depend on the state at the last frame only."""
 
-    def __init__(self, scene: Scene, built: Built) -> None:
+    def __init__(self, scene: Scene, built: Built, notice: Notice | None = None) -> None:
         self.scene, self.built, self.step = scene, built, built.step
+        self._notice = notice
+        self._began: tuple[float, int] | None = None  # Clock [s] and substeps at the first substep of this process.
+        self._noticed = -math.inf  # Clock at the latest notice or frame [s].
         self.state = built.state
         self.frame = -1
         self.totals = Totals()
@@ -287,6 +299,7 @@ class Simulation:
             writer.submit(frame)
             if progress is not None and frame.number > 0:
                 progress(self._figures)
+                self._noticed = time.perf_counter()
             self._check_stop(stop)
 
         if self.frame < 0:
@@ -368,6 +381,8 @@ class Simulation:
         ``meanwhile`` is called whenever the host would otherwise only wait for a device.
         """
         now, largest = begin, 0.0
+        if self._began is None:
+            self._began = time.perf_counter(), self.totals.substeps
         rounding = 1e-9 * (end - begin)
         while now < end - rounding:
             self._emit(now + rounding)
@@ -392,8 +407,24 @@ class Simulation:
                 heap.trim()
             self.totals.substeps += steps
             self.totals.smallest_dt = min(self.totals.smallest_dt, dt)
+            self._give_notice(now, dt)
         self.totals.largest_cfl = max(self.totals.largest_cfl, largest)
         return largest
+
+    def _give_notice(self, now: float, dt: float) -> None:
+        """Notice of a long run, at a simulated time and with the present time step [s]."""
+        clock = time.perf_counter()
+        left = (self.scene.duration - now) / dt
+        if self._notice is None or self._began is None or left < LONG_RUN or clock < self._noticed + BETWEEN_NOTICES:
+            return
+        self._noticed = clock
+        since, before = self._began
+        seconds = left * (clock - since) / (self.totals.substeps - before)
+        hours = f"{seconds / 3600:.2g} hours" if seconds > 3600 else f"{seconds / 60:.2g} minutes"
+        self._notice(
+            f"frame {self.frame} of {self.scene.frames}, t = {now:.3g} s: about {left:.2g} substeps of {dt:.2g} s are "
+            f"left until {self.scene.duration:g} s, which take some {hours}"
+        )
 
     def _choose_dt(self, span: float, rates: list[float]) -> tuple[float, int]:
         """Time step and number of steps that fill ``span``, for the limits of the scenes [1/s]."""
