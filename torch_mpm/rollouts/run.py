@@ -103,9 +103,10 @@ def rollout(
         steps = _as_planned(steps, plan)
     if truncate is None and hook is None and norms is None and prefix == 0 and every == 1 and every is not True:
         check_state(state)
-        with steps.control(state) as left:
-            return left(_computed(steps, state, plan))
-    return _in_parts(steps, state, Parts(n, prefix, truncate, hook, every, norms), plan)
+        with steps.call(state) as ended, steps.control(state) as left:
+            return ended(left(_computed(steps, state, plan)))
+    with steps.call(state) as ended:
+        return ended(_in_parts(steps, state, Parts(n, prefix, truncate, hook, every, norms), plan))
 
 
 def _in_parts(steps: Steps, state: State, parts: Parts, plan: RolloutPlan | None) -> State:

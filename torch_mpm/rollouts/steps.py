@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ..boundaries.control import Leave, control_step
 from ..state.state import State
+from ..step.step import Step
 from .checkpoints import Checkpoints
 
 
@@ -36,3 +37,8 @@ class Steps(NamedTuple):
         """Context in which obstacles move as they do in these steps."""
         step: Any = self.step
         return control_step(step, state, self.n, self.dt)
+
+    def call(self, state: State) -> contextlib.AbstractContextManager[Callable[[State], State]]:
+        """Context of `ErrorStatus.call`, in which these steps are one call."""
+        step: Any = self.step
+        return step._error_status.call(state) if isinstance(step, Step) else contextlib.nullcontext(lambda state: state)

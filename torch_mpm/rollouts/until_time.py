@@ -120,13 +120,13 @@ def rollout_to(
     unsorted = plan_call(None, facts_of(Steps(step, 1, 1.0), given)._replace(steps=most)).order > 0
     start = sort_particles(step, given) if unsorted else given
     clocks = Clocks(step, start, time, cfl, longest, most, previous)
-    with control_step(step, start, most, PACE, clocks.seconds) as left:
+    with step._error_status.call(state) as ended, control_step(step, start, most, PACE, clocks.seconds) as left:
         while (counts := clocks.remaining()) and counts[-1] > every:
             clocks.advance(min((counts[-1] - 1) // every, MOST_SEGMENTS), every, options)
         clocks.finish(counts, options)
         arrival = clocks.arrival()
-        arrival = arrival._replace(state=left(arrival.state))
-    return arrival._replace(state=restore_order(step, arrival.state, start, given)) if unsorted else arrival
+        end = left(arrival.state)
+        return arrival._replace(state=ended(restore_order(step, end, start, given) if unsorted else end))
 
 
 def _compensated(step: Step, state: State, cfl: float, longest: float) -> State:

@@ -76,8 +76,9 @@ class Failures:
 
     Attributes:
         failed: whether a scene has any problem, bool [B] on the device of the particles.
-        given: NaN or infinite entries of the first state of the step, by field; not problems themselves, but the cause
-            of later ones.
+        given: NaN or infinite entries of the first state of the step, by field; in the error of `Step.check` also of
+            the state given to the latest call, of gravity and of the motion of obstacles. Not problems themselves, but
+            the cause of later ones.
         problems: each kind that was checked:
             "not_finite": particles whose position is NaN or infinite,
             "outside": particles that left the grid,
@@ -175,8 +176,8 @@ def problem_of_particles(state: State, scenes: int, bad: Tensor, what: str, advi
     return Problem(count, f"particles {what}", advice, first, identity)
 
 
-def problems_of_first_state(state: State, scenes: int) -> dict[str, Problem]:
-    """NaN or infinite entries of the first state of a step, by field. Does not wait for the device."""
+def problems_of_first_state(state: State, scenes: int, when: str = "before the first step") -> dict[str, Problem]:
+    """NaN or infinite entries of the state before steps, by field. Does not wait for the device."""
     problems = {}
     fields = {name: getattr(state, name) for name in PARTICLE_FIELDS} | state.extra
     for name, value in fields.items():
@@ -189,7 +190,7 @@ def problems_of_first_state(state: State, scenes: int) -> dict[str, Problem]:
                 state,
                 scenes,
                 bad,
-                f"had {name} that is NaN or infinite in the state before the first step",
+                f"had {name} that is NaN or infinite in the state {when}",
                 "give each particle finite values",
             )
     return problems

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Iterator
+import operator
+import weakref
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -31,6 +33,52 @@ NO_PROBLEM = tuple(-1 if column in FIRST_PROBLEMS else 0 for column in Status)
 """Row of the status before the first activation (csrc/grid/status.h)."""
 
 
+class _Call:
+    """Calls of one user of a grid, one after another.
+
+    The given state is kept until the next call, so that a failure can be explained by it; results are not kept.
+
+    Attributes:
+        goes_on: whether the host is inside a call.
+        given: state given to the latest call and the status before it; None for the first state, which
+            `ErrorStatus.begin` examines, and for the result of the previous call.
+    """
+
+    def __init__(self) -> None:
+        self.goes_on = False
+        self.given: tuple[State, Tensor] | None = None
+        self._end: tuple[weakref.ref[Tensor] | None, ...] = ()
+
+    def of(self, state: State, status: Tensor | None) -> _Call:
+        """The context of a call from a state, after steps with a status."""
+        end = [None if t is None else t() for t in self._end]
+        continues = bool(end) and all(map(operator.is_, _fields(state), end))
+        self.given = None
+        if not (continues or status is None or is_traced(state.x) or is_captured(state.x) or is_transformed()):
+            trained = any(t is not None and t.requires_grad for t in _fields(state))
+            self.given = state.detach() if trained else state, status
+        return self
+
+    def __enter__(self) -> Callable[[State], State]:
+        self.goes_on = True
+        return self._ended
+
+    def __exit__(self, *_: object) -> None:
+        self.goes_on = False
+
+    def _ended(self, result: State) -> State:
+        self._end = tuple(None if t is None else weakref.ref(t) for t in _fields(result))
+        return result
+
+
+def _fields(state: State) -> tuple[Tensor | None, ...]:
+    """Fields by which a state is recognised as the result of steps."""
+    return state.x, state.v, state.mass, state.volume, state.C, state.F, state.J
+
+
+_INSIDE: contextlib.AbstractContextManager[Callable[[State], State]] = contextlib.nullcontext(lambda state: state)
+
+
 class ErrorStatus:
     """Errors of all activations of one user of a grid, including those replayed by CUDA graphs.
 
@@ -53,6 +101,27 @@ class ErrorStatus:
         self.contradicted: Tensor | None = None
         self.given: dict[str, Problem] = {}
         self._replayed: list[Tensor] = []
+        self._call = _Call()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """State for copies, without the states of calls."""
+        return {**self.__dict__, "_call": _Call()}
+
+    def call(self, state: State) -> contextlib.AbstractContextManager[Callable[[State], State]]:
+        """Context of steps from a state; the function it returns gets their result, and returns it. Contexts inside are
+        part of the same call.
+        """
+        return _INSIDE if self._call.goes_on else self._call.of(state, self.status)
+
+    def given_to_latest_call(self, scenes: int) -> tuple[dict[str, Problem], int]:
+        """Entries that were NaN or infinite in the state given to the latest call, by field, and the number of steps
+        before it; nothing where the state is the first one, or the result of the previous call. Synchronises.
+        """
+        if self._call.given is None:
+            return {}, 0
+        state, before = self._call.given
+        steps = int(before[0, Status.ACTIVATIONS])
+        return problems_of_first_state(state, scenes, f"given before step {steps}"), steps
 
     def begin(self, state: State, scenes: int) -> None:
         """Check the first state, before a step from it."""
@@ -139,7 +208,7 @@ class ErrorStatus:
         return self.refused
 
     def reset(self) -> None:
-        self.status, self.given = None, {}
+        self.status, self.given, self._call.given = None, {}, None
         if self.refused is not None:  # CUDA graphs may write to it.
             self.refused.zero_()
         self.contradicted = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import warnings
 from collections.abc import Callable, Sequence
@@ -37,6 +38,7 @@ from ..precision import from_half, full_precision
 from ..state.state import State, check_state, identity_deformation
 from .clocks import time_after
 from .failures import Failures, problems_of_state, raise_failures
+from .inputs import given_problems
 from .particle_operations import ParticleOperation, operated
 from .pause import paused, standing
 from .stability import LawDiagnostics, chosen_dt, law_diagnostics, stability_report
@@ -186,11 +188,11 @@ class Step(TensorModule):
             ValueError, TypeError: for wrong shapes, dtypes or devices, or a number dt that is not positive.
             GridOverflowError: on the CPU, where a grid of fixed `max_blocks` is full.
         """
-        state = self.with_residual(self.prepare(state), dt)
+        given, state = state, self.with_residual(self.prepare(state), dt)
         if torch.compiler.is_compiling():
             return paused(self._advanced, self._error_status, state, dt, self.grid.scenes)
-        with control_step(self, state, 1, dt) as left:
-            return left(paused(self._advanced, self._error_status, state, dt, self.grid.scenes))
+        with self._error_status.call(given) as ended, control_step(self, state, 1, dt) as left:
+            return ended(left(paused(self._advanced, self._error_status, state, dt, self.grid.scenes)))
 
     def _advanced(self, state: State, dt: float | Tensor) -> State:
         """A prepared state one step later."""
@@ -563,7 +565,10 @@ class Step(TensorModule):
                 out, J ≤ 0); such a particle has zero stress from then on.
             GridOverflowError: if more blocks were active than the grid has room for, and nothing else is wrong.
         """
-        raise_failures(self.failures(state), self._error_status.all(), self.grid)
+        failures = self.failures(state)
+        if bool(failures.failed.any()):
+            failures = dataclasses.replace(failures, given={**failures.given, **given_problems(self, failures, state)})
+        raise_failures(failures, self._error_status.all(), self.grid)
         if self.heat is not None:
             self.heat.fronts.warn()
         locking.warn(self.law, self.grid.kernel)
