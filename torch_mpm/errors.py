@@ -56,10 +56,13 @@ class ThinWallWarning(UserWarning):
 
 
 class DamagedFileError(ValueError):
-    """File of a run that is damaged, was changed by another program, or is of another kind."""
+    """File of a run that is damaged, was changed by another program, or is of another kind.
 
-    def __init__(self, path: object, problem: str, remedy: str) -> None:
-        super().__init__(f"{path}: {problem}; {remedy}")
+    The first argument alone is a complete message: so pickle and data loaders create the error of another process.
+    """
+
+    def __init__(self, path: object, problem: str = "", remedy: str = "") -> None:
+        super().__init__(f"{path}: {problem}; {remedy}" if problem else str(path))
 
 
 def shape_of(x: object) -> str:

@@ -5,6 +5,7 @@ import hashlib
 import itertools
 import json
 import os
+import pickle
 
 import numpy as np
 import pytest
@@ -171,8 +172,8 @@ def test_commands_report_a_flipped_bit_of_an_attribute(tmp_path, capsys, name, s
 def test_readers_report_a_flipped_bit_of_an_attribute(tmp_path, name):
     folder = datasets.make_dataset(tmp_path / "set")
     flip_word(folder)
-    with pytest.raises((DamagedFileError, RuntimeError), match=r"shard_00000\.h5: is damaged: its checksum is wrong"):
-        READERS[name](folder)  # A loader raises the error of a worker as a RuntimeError.
+    with pytest.raises(DamagedFileError, match=r"shard_00000\.h5: is damaged: its checksum is wrong"):
+        READERS[name](folder)
 
 
 @pytest.mark.parametrize("export", [export_scenes_vtk, export_scenes_ply])
@@ -184,6 +185,12 @@ def test_exports_of_scenes_compare_the_whole_shards(tmp_path, export):
     with pytest.raises(DamagedFileError, match=r"shard_00001\.h5: is damaged: its checksum is wrong"):
         export(folder, tmp_path / "out", [0, 5])
     assert not (tmp_path / "out").exists()
+
+
+def test_the_error_passes_between_processes():
+    error = DamagedFileError("shard.h5", "is damaged", "generate again")
+    copy = pickle.loads(pickle.dumps(error))
+    assert type(copy) is DamagedFileError and str(copy) == str(error) == "shard.h5: is damaged; generate again"
 
 
 # ---- measures of stresses

@@ -211,6 +211,14 @@ def test_a_corrupt_shard_is_found_and_made_anew(whole, copy, name, damage):
     assert_same(whole, copy)
 
 
+def test_a_shard_of_another_number_is_found_and_made_anew(whole, copy):
+    for place in (shard_path, lambda folder, index: record_path(shard_path(folder, index))):
+        shutil.copy(place(copy, 1), place(copy, 0))
+    assert "has the scenes [2, 3], not 0 to 1" in next(verify(copy))
+    assert generate(configuration(), copy, device="cpu", check=True)["scenes"] == 2
+    assert_same(whole, copy)
+
+
 def test_a_full_disk_keeps_what_is_finished(whole, tmp_path):
     (tmp_path / "set.toml").write_text(json_to_toml())
     size = shard_path(whole, 0).stat().st_size

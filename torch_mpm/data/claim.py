@@ -145,7 +145,7 @@ class Claim:
         self._unlock(shard)
 
     def is_finished(self, shard: int, check: bool = False) -> bool:
-        """Whether a shard has a record and a file of the length in it, or with `check` of the recorded bytes."""
+        """Whether a shard has a record and a file of the length in it, or with `check` its scenes and these bytes."""
         if (shard, check) in self._whole:
             return True
         path = shard_path(self.folder, shard)
@@ -156,6 +156,7 @@ class Claim:
             good = path.stat().st_size == record.bytes
             if good and check:
                 Shard(path, check=True).close()
+                good = [scene.id for scene in record.scenes] == self.record.ids(shard)
         except (FileNotFoundError, DamagedFileError):
             return False
         if good:
