@@ -33,15 +33,20 @@ NO_PROBLEM = tuple(-1 if column in FIRST_PROBLEMS else 0 for column in Status)
 """Row of the status before the first activation (csrc/grid/status.h)."""
 
 
+KEPT_PARTICLES = 2**18
+"""Number of particles up to which a given state is kept, some 30 MB."""
+
+
 class _Call:
     """Calls of one user of a grid, one after another.
 
-    The given state is kept until the next call, so that a failure can be explained by it; results are not kept.
+    A given state of at most `KEPT_PARTICLES` is kept until the next call, so that a failure can be explained by it;
+    results are not kept.
 
     Attributes:
         goes_on: whether the host is inside a call.
         given: state given to the latest call and the status before it; None for the first state, which
-            `ErrorStatus.begin` examines, and for the result of the previous call.
+            `ErrorStatus.begin` examines, for the result of the previous call, and for larger states.
     """
 
     def __init__(self) -> None:
@@ -54,7 +59,8 @@ class _Call:
         end = [None if t is None else t() for t in self._end]
         continues = bool(end) and all(map(operator.is_, _fields(state), end))
         self.given = None
-        if not (continues or status is None or is_traced(state.x) or is_captured(state.x) or is_transformed()):
+        known = continues or status is None or state.x.shape[0] > KEPT_PARTICLES
+        if not (known or is_traced(state.x) or is_captured(state.x) or is_transformed()):
             trained = any(t is not None and t.requires_grad for t in _fields(state))
             self.given = state.detach() if trained else state, status
         return self
