@@ -306,7 +306,7 @@ def test_the_well_has_obstacles_and_scalars(tmp_path):
     def words(k):
         ball = {"shape": "sphere", "center": [0.3, 1.0], "radius": 0.2, "velocity": [20.0, 0.0]}
         floor = {"shape": "box", "center": [0.5, 0.09], "size": [1.0, 0.18]}
-        sand = {"law": "quartic_sand", "E": 1e6 + k, "friction_angle": 30.0 + k, "cohesive": True}
+        sand = {"law": "quartic_sand", "E": 1e6 + k, "friction_angle": 30.0 + k, "volume_correction": True}
         return {"gravity": [0.0, -9.8], "material": {"sand": sand}, "obstacle": [ball, floor]}
 
     with_words(source, words)
@@ -369,10 +369,9 @@ def test_a_jepa_reads_it(tmp_path):
     """Channels by name: density, obstacle, velocity; scenes differ in a number of their material."""
     source = datasets.make_dataset(tmp_path / "set")
     floor = {"shape": "box", "center": [0.5, 0.1], "size": [1.0, 0.2]}
-    with_words(
-        source,
-        lambda k: {"gravity": [0.0, -9.8], "material": {"sand": {"law": "x", "E": 1e6 + k}}, "obstacle": [floor]},
-    )
+    gravity = [0.0, -9.8]
+    sand = [{"law": "neo_hookean", "E": 1e6 + k} for k in range(10)]
+    with_words(source, lambda k: {"gravity": gravity, "material": {"sand": sand[k]}, "obstacle": [floor]})
     folder, frames = data.export_well(source, tmp_path / "out", dx=0.1), 3
     for split in IDS:
         samples, given = list(jepa_samples(folder, split, frames)), expected(source, split)

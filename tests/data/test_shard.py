@@ -293,12 +293,8 @@ def no_arrays(file, tmp_path):
         del file["scene_0000000"][name]
 
 
-def no_material(file, tmp_path):
-    file["scene_0000000"].attrs["scene"] = '{"material": [1]}'
-
-
-def no_gravity(file, tmp_path):
-    file["scene_0000000"].attrs["scene"] = '{"gravity": [1, "a"]}'
+def other_shape(file, tmp_path):
+    file["scene_0000000"]["velocity"] = file["scene_0000000/position"][..., 0]
 
 
 def strange_attribute(file, tmp_path):
@@ -307,7 +303,7 @@ def strange_attribute(file, tmp_path):
 
 ATTACKS = [
     *(external, soft, raw, virtual, bomb, references, other_filter, a_group, strange_attribute),
-    *(one_particle_less, other_bytes, no_arrays, no_material, no_gravity),
+    *(one_particle_less, other_bytes, other_shape, no_arrays),
 ]
 
 

@@ -44,6 +44,7 @@ from . import distribution
 from .content_checks import shape_problems, value_problems
 from .distribution import Words
 from .folder import MOST_SHARDS
+from .scene_words import number_problems
 from .stress import MEASURES
 from .whole_files import LONGEST_NAME, is_name
 
@@ -204,7 +205,10 @@ class Configuration:
         Raises:
             SceneError: for problems in them.
         """
-        return Scene.from_words(self.scene_words(*contents), folder=self.folder, source=self.source)
+        words = self.scene_words(*contents)
+        if problems := number_problems(words):
+            raise SceneError(problems, self.source)
+        return Scene.from_words(words, folder=self.folder, source=self.source)
 
     @property
     def drawn_parameters(self) -> list[str]:

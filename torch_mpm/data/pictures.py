@@ -189,11 +189,9 @@ def _obstacles(words: dict[str, Any], time: float, bounds: Any) -> list[Any]:
     if not words.get("obstacle"):
         return []
     try:
-        from ..scene import Scene
+        from .obstacle_fields import obstacles_of
     except ImportError:
         return []
     from ..render import obstacle_shapes
-    from ..scene.places import obstacle
 
-    models = Scene.from_words(words).entries()[0].obstacle
-    return [shape for model in models for shape in obstacle_shapes(obstacle(model, None), time, bounds)]
+    return [shape for obstacle in obstacles_of(words) for shape in obstacle_shapes(obstacle, time, bounds)]

@@ -26,12 +26,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import DamagedFileError, is_finite
+from ..errors import DamagedFileError
 from ..files import check_file
 from .hdf5 import READ_ERRORS, check_seal, h5py_module, storage_problem, unreadable
 from .packing import array_digest
+from .scene_words import read_words
 from .statistics import Motion, Sums
-from .stress import MEASURES, measure_of
+from .stress import MEASURES, TENSORS, measure_of
 from .whole_files import check_record, count, file_hash, write_record
 
 Array = npt.NDArray[Any]
@@ -157,22 +158,23 @@ class StoredScene:
     """Scene of an open shard. ``scene["position"]`` reads an array, ``scene.window("position", k, 7)`` some frames.
 
     Attributes:
+        path, name: the shard, and the name of the group there.
         attributes: texts and numbers about the scene.
         frames, particles, dim: T, N and D; 0 for a failed scene.
     """
 
     def __init__(self, path: Path, group: Any, told: SceneRecord, intact: Callable[[], bool]) -> None:
-        self.path, self._group, self._name, self._digests = path, group, group.name[1:], told.digests
+        self.path, self._group, self.name, self._digests = path, group, group.name[1:], told.digests
         self._intact = intact
         try:
             problem, self.attributes = _scene_problem(group, path.stat().st_size)
         except READ_ERRORS as error:
-            raise unreadable(path, f"{self._name} cannot be read", error, REMEDY, intact) from None
+            raise unreadable(path, f"{self.name} cannot be read", error, REMEDY, intact) from None
         shape: tuple[int, ...] = (0, 0, 0)
         if not problem and "position" in group:
             shape = group["position"].shape
         self.frames, self.particles, self.dim = shape
-        if problem := problem or self._difference(told) or _words_problem(self.words, self.dim):
+        if problem := problem or self._difference(told):
             raise DamagedFileError(path, f"{group.name[1:]} {problem}", REMEDY)
 
     def _difference(self, told: SceneRecord) -> str:
@@ -185,12 +187,15 @@ class StoredScene:
 
     @functools.cached_property
     def words(self) -> dict[str, Any]:
-        """Scene file of the scene; empty where its attributes lack it."""
+        """Scene file of the scene; empty where its attributes lack it.
+
+        Raises:
+            DamagedFileError: for words that are no scene file, with the key.
+        """
         try:
-            words = json.loads(str(self.attributes.get("scene", "")))
-        except (ValueError, RecursionError):
-            return {}
-        return words if isinstance(words, dict) else {}
+            return read_words(str(self.attributes.get("scene", "{}")), self.dim)
+        except ValueError as error:
+            raise DamagedFileError(self.path, f"{self.name} has a wrong scene file: {error}", REMEDY) from None
 
     @property
     def names(self) -> list[str]:
@@ -210,7 +215,7 @@ class StoredScene:
         try:
             return self._group[name].attrs.get("measure")
         except READ_ERRORS as error:
-            raise unreadable(self.path, f"{self._name}/{name} cannot be read", error, REMEDY, self._intact) from None
+            raise unreadable(self.path, f"{self.name}/{name} cannot be read", error, REMEDY, self._intact) from None
 
     def shape(self, name: str) -> tuple[int, ...]:
         shape: tuple[int, ...] = self._group[name].shape
@@ -240,10 +245,10 @@ class StoredScene:
                 values: Array = self._group[name][part]
                 if part is not ... or name not in self._digests or array_digest(values).hex() == self._digests[name]:
                     return values
-                raise DamagedFileError(self.path, f"{self._name}/{name}: its checksum is wrong", REMEDY)
+                raise DamagedFileError(self.path, f"{self.name}/{name}: its checksum is wrong", REMEDY)
         except READ_ERRORS as error:
-            raise unreadable(self.path, f"{self._name}/{name} cannot be read", error, REMEDY, self._intact) from None
-        raise KeyError(f"{self._name} of {self.path} has no {name!r}")
+            raise unreadable(self.path, f"{self.name}/{name} cannot be read", error, REMEDY, self._intact) from None
+        raise KeyError(f"{self.name} of {self.path} has no {name!r}")
 
 
 class Shard:
@@ -351,21 +356,6 @@ def _is_positions(data: Any) -> bool:
     return data.ndim == 3 and data.dtype.kind == "f" and data.shape[2] in (2, 3)
 
 
-def _words_problem(words: dict[str, Any], dim: int) -> str:
-    """Problem of the scene file of a scene; "" for none."""
-    gravity = words.get("gravity") or [0.0] * dim
-    numbers = isinstance(gravity, list) and all(is_finite(v) for v in gravity)
-    if not numbers or (dim and len(gravity) != dim):
-        return f"has a scene file whose gravity is {gravity!r:.100}"
-    for key, kind in (("material", dict), ("body", list), ("obstacle", list)):
-        things = words.get(key) or kind()
-        if not isinstance(things, kind):
-            return f"has a scene file whose {key} is no {kind.__name__}"
-        if not all(isinstance(v, dict) for v in (things.values() if isinstance(things, dict) else things)):
-            return f"has a scene file with a {key} that is no table"
-    return ""
-
-
 def _scene_problem(group: Any, size: int) -> tuple[str, dict[str, Any]]:
     """Reason why a group is not a scene, "" for none, and its attributes; the errors of h5py."""
     h5py = h5py_module()
@@ -382,10 +372,14 @@ def _scene_problem(group: Any, size: int) -> tuple[str, dict[str, Any]]:
     if len(group) and ("position" not in group or not _is_positions(group["position"])):
         return "has no positions [T, N, 2 or 3]", {}
     for name in group:
-        frames, particles, _ = group["position"].shape
+        frames, particles, dim = group["position"].shape
         shape, kind = group[name].shape, group[name].dtype
         if shape[:2] != (frames, particles) and shape != (particles,):
             return f"has {name!r} of shape {list(shape)}, which is neither [T, N, ...] nor [N]", {}
+        known = {**dict.fromkeys(("F", *TENSORS), (frames, particles, dim, dim)), "velocity": (frames, particles, dim)}
+        known |= dict.fromkeys(("mass", "volume"), (particles,))
+        if shape != known.get(name, shape):
+            return f"has {name!r} of shape {list(shape)}, not {list(known[name])}", {}
         if kind.str not in STORED or (name == "particle_type" and (kind.kind != "i" or len(shape) != 1)):
             return f"has {name!r} of type {kind} and shape {list(shape)}", {}
     return "", {name: v if isinstance(v, str) else v.item() for name, v in attributes.items()}

@@ -183,21 +183,31 @@ def render_problems(scene: Any) -> Iterator[str]:
 def _item_problems(key: str, item: Any, scene: Any) -> list[str]:
     """Problems of a body, an obstacle or an emitter."""
     dim = len(scene.grid.lower)
+    if isinstance(item, schema.Obstacle):
+        return obstacle_problems(key, item, dim)
     found = list(_dimension_problems(key, item, dim))
     if found or len(scene.grid.upper) != dim:
         return found
     try:
         if isinstance(item, schema.Emitter):
             return [*_nozzle_problems(key, item, scene)]
-        if isinstance(item, schema.Obstacle):
-            obstacle(item, None).pose(0.0)
-            return []
         if isinstance(item, schema.PointsBody) and item.particles is not None:
             return [f"{key}.particles: the particles of {item.file} are those of the file; remove the key"]
         shape = region(item, None)
         return [] if shape is None else list(bounds_problems(key, item, shape, scene.grid))
     except (ValueError, TypeError) as error:
         return [f"{key}{called(item)}: {error}"]
+
+
+def obstacle_problems(key: str, item: schema.Obstacle, dim: int) -> list[str]:
+    """Problems of an obstacle of a scene with ``dim`` dimensions."""
+    if found := list(_dimension_problems(key, item, dim)):
+        return found
+    try:
+        obstacle(item, None).pose(0.0)
+    except (ValueError, TypeError) as error:
+        return [f"{key}{called(item)}: {error}"]
+    return []
 
 
 def _dimension_problems(key: str, item: Any, dim: int) -> Iterator[str]:

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from ..folder import DatasetError, DatasetFolder
 from ..host_memory import in_words
 from ..metadata import metadata, write_metadata
+from ..shard import StoredScene
 from ..statistics import BOUNDARY
 from ..stress import explicit_name
 from ..whole_files import building_path, named_errors, output_path, remove_leftovers
@@ -35,7 +36,7 @@ class ExportedScene:
     id: int
     position: Array
     particle_type: Array
-    arrays: Any
+    arrays: StoredScene
 
     @property
     def boundary(self) -> Array:
@@ -61,17 +62,32 @@ class Export:
         """
         for number in exported_ids(self.dataset, split):
             stored = self.dataset.scene(number)
-            position = np.ascontiguousarray(stored["position"], np.float32)
-            if "particle_type" not in stored:
-                raise DatasetError(f"scene {number} must have particle_type [N]")
-            kind = stored["particle_type"]
+            position = as_float32(stored, "position")
+            kind = required(stored, "particle_type")
             if kind.min() < 0 or kind.max() >= PARTICLE_TYPES:
                 raise DatasetError(f"particle_type must be within 0 and {PARTICLE_TYPES - 1}, got {kind.max()}")
             yield ExportedScene(number, position, kind, stored)
 
 
-def fields_of(scene: ExportedScene, names: Sequence[str], own: Sequence[str] = ()) -> dict[str, Array]:
-    """Further arrays of a scene, [T, N, ...] or [N]; stresses have their measure in their name.
+def required(scene: StoredScene, name: str) -> Array:
+    """Array of a scene; DatasetError where it is missing."""
+    if name not in scene:
+        raise DatasetError(f"{scene.path}: {scene.name} must have {name}")
+    return scene[name]
+
+
+def as_float32(scene: StoredScene, name: str) -> Array:
+    """Array of a scene in float32; DatasetError where it is missing, or has numbers that float32 cannot hold."""
+    values = required(scene, name)
+    with np.errstate(over="ignore"):
+        cast = np.ascontiguousarray(values, np.float32)
+    if values.dtype != cast.dtype and not np.isfinite(cast).all():
+        raise DatasetError(f"{scene.path}: {name} of {scene.name} has numbers that float32 cannot hold")
+    return cast
+
+
+def fields_of(scene: ExportedScene, names: Sequence[str], own: Sequence[str] = ()) -> dict[str, str]:
+    """Further arrays of a scene, [T, N, ...] or [N], by their name in the export, which has the measure of a stress.
 
     Args:
         scene: the scene.
@@ -82,7 +98,7 @@ def fields_of(scene: ExportedScene, names: Sequence[str], own: Sequence[str] = (
         DatasetError: for an array that is missing, or whose name in the export is that of another one.
     """
     measures, always = scene.arrays.measures, ("position", "particle_type")
-    found: dict[str, Array] = {}
+    found: dict[str, str] = {}
     for name in dict.fromkeys(names):
         if name in always or name not in scene.arrays:
             known = ", ".join(n for n in scene.arrays.names if n not in always)
@@ -91,7 +107,7 @@ def fields_of(scene: ExportedScene, names: Sequence[str], own: Sequence[str] = (
         written = explicit_name(name, measures.get(name, ""))
         if written in (*own, *found):
             raise DatasetError(f"fields: {name!r} would be written as {written!r}, a name of another array")
-        found[written] = scene.arrays[name]
+        found[written] = name
     return found
 
 

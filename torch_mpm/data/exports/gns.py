@@ -8,7 +8,7 @@ import numpy as np
 
 from ..folder import DatasetError, DatasetFolder
 from ..whole_files import named_errors
-from .common import Export, ExportedScene, exporting
+from .common import Export, ExportedScene, as_float32, exporting
 
 ANGLES = ("friction_angle",)
 """Parameters that data sets hold in degrees."""
@@ -60,5 +60,5 @@ def _entry(scene: ExportedScene, material: str | None) -> tuple[np.ndarray, ...]
         return scene.position, kind
     if material not in scene.arrays or scene.arrays.shape(material) != kind.shape:
         raise DatasetError(f"material must be the name of an array [N] of every scene, got {material!r}")
-    values = scene.arrays[material].astype(np.float32)
+    values = as_float32(scene.arrays, material)
     return scene.position, kind, np.tan(np.radians(values)) if material in ANGLES else values

@@ -66,7 +66,8 @@ def _write(export: Export, split: str, codes: dict[int, int], fields: Sequence[s
             group = file.create_group(f"{k:05d}")
             group.create_dataset("position", data=scene.position, compression="gzip", compression_opts=1, shuffle=True)
             group.create_dataset("particle_type", data=_types(scene, codes))
-            for name, values in fields_of(scene, fields).items():
+            for name, field in fields_of(scene, fields).items():
+                values = scene.arrays[field]
                 group.create_dataset(name, data=values, compression="gzip", compression_opts=1, shuffle=True)
             disk.check()
         empty = not len(file)

@@ -40,7 +40,7 @@ def export_neuralmpm(
                         options = {"compression": "gzip", "compression_opts": 1} if values.size else {}
                         file.create_dataset(name, data=values, **options)
                     file.create_dataset("types", data=scene.particle_type[free].astype("i8"))
-                    for name, rows in fields_of(scene, fields, ("particles", "boundary", "types")).items():
-                        values = rows[:, free] if rows.ndim > 1 else rows[free]
-                        file.create_dataset(name, data=values)
+                    for name, field in fields_of(scene, fields, ("particles", "boundary", "types")).items():
+                        values = scene.arrays[field]
+                        file.create_dataset(name, data=values[:, free] if values.ndim > 1 else values[free])
     return export.target

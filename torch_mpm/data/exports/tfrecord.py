@@ -18,7 +18,7 @@ import numpy as np
 from ... import optional
 from ..folder import DatasetError, DatasetFolder
 from ..whole_files import named_errors
-from .common import Array, ExportedScene, exported_ids, exporting, fields_of
+from .common import Array, ExportedScene, as_float32, exported_ids, exporting, fields_of
 
 log = logging.getLogger(__name__)
 
@@ -77,7 +77,8 @@ def _context_statistics(dataset: DatasetFolder) -> dict[str, list[float]]:
 
 def _frames(scene: ExportedScene, fields: Sequence[str], context: Array | None) -> dict[str, Array]:
     """Features of every frame, by name: arrays [T, ...]."""
-    more = fields_of(scene, fields, ("step_context",))
+    names = fields_of(scene, fields, ("step_context",))
+    more = {name: as_float32(scene.arrays, field) for name, field in names.items()}
     if flat := [name for name, values in more.items() if len(values.shape) < 2]:
         raise DatasetError(f"fields must be arrays [T, N, ...], got {flat[0]!r}")
     steps = {} if context is None else {"step_context": np.tile(context, (len(scene.position), 1))}

@@ -17,7 +17,7 @@ from ..obstacle_fields import obstacle_mask, obstacles_of
 from ..rasterise import cell_centres, rasterise
 from ..statistics import Sums
 from ..whole_files import file_name, write_whole
-from .common import Array, Export, ExportedScene, exported_ids, exporting
+from .common import Array, Export, ExportedScene, as_float32, exported_ids, exporting
 
 AXES = ("x", "y", "z")
 
@@ -133,8 +133,12 @@ def _scalars(export: Export, number: int) -> dict[str, float]:
     gravity = words.get("gravity") or [0.0] * export.dataset.record.dim
     found = {f"gravity_{axis}": float(value) for axis, value in zip(AXES, gravity, strict=False)}
     for material, values in words.get("material", {}).items():
-        numbers = {key: v for key, v in values.items() if isinstance(v, (int, float)) and not isinstance(v, bool)}
-        found |= {f"{material}_{key}": float(value) for key, value in numbers.items()}
+        for key, value in values.items():
+            if isinstance(value, (int, float)) and not isinstance(value, bool):
+                name = f"{material}_{key}".replace("/", "_")  # HDF5 separates groups by slashes.
+                if name in found:
+                    raise DatasetError(f"scene {number} has two numbers that would be the scalar {name!r}")
+                found[name] = float(value)
     return found
 
 
@@ -172,8 +176,10 @@ def _layout(file: Any, export: Export, orders: dict[str, int], dx: float, count:
 
 def _fields(scene: ExportedScene, export: Export, dx: float) -> dict[str, Array]:
     """Values of all particles that are not a boundary."""
-    record, free = export.dataset.record, ~scene.boundary
-    velocity, mass = velocity_of(scene.arrays, record.frame_interval), scene.arrays["mass"]
-    x, v, m = (torch.from_numpy(a.astype(np.float32)) for a in (scene.position[:, free], velocity[:, free], mass[free]))
+    record, free, stored = export.dataset.record, ~scene.boundary, scene.arrays
+    known = "velocity" in stored
+    velocity = as_float32(stored, "velocity") if known else velocity_of(stored, record.frame_interval)
+    values = (scene.position[:, free], velocity[:, free], as_float32(stored, "mass")[free])
+    x, v, m = (torch.from_numpy(a.astype(np.float32)) for a in values)
     density, mean = rasterise(x, v, m, record.lower, record.upper, dx)
     return {"density": density.numpy(), "velocity": mean.numpy()}
