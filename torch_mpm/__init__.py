@@ -3,6 +3,7 @@
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from . import _interrupted_start as _interrupted_start  # First, as the imports below take a second or more.
 from . import _library as _library
 from . import _moved, laws, ops
 from .boundaries import SDF, Box, Capsule, Obstacle, Plane, Revolved, Sphere, Walls, Waypoints

@@ -209,7 +209,7 @@ class StoredScene:
         try:
             return {name: measure_of(name, measure) for name, measure in stored.items()}
         except ValueError as error:
-            raise DamagedFileError(self.path, f"{self._name}/{error}", REMEDY) from None
+            raise DamagedFileError(self.path, f"{self.name}/{error}", REMEDY) from None
 
     def _measure(self, name: str) -> Any:
         try:
