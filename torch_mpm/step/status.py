@@ -59,8 +59,8 @@ class _Call:
         end = [None if t is None else t() for t in self._end]
         continues = bool(end) and all(map(operator.is_, _fields(state), end))
         self.given = None
-        known = continues or status is None or state.x.shape[0] > KEPT_PARTICLES
-        if not (known or is_traced(state.x) or is_captured(state.x) or is_transformed()):
+        known = continues or state.x.shape[0] > KEPT_PARTICLES
+        if not (known or status is None or is_traced(state.x) or is_captured(state.x) or is_transformed()):
             trained = any(t is not None and t.requires_grad for t in _fields(state))
             self.given = state.detach() if trained else state, status
         return self
