@@ -63,14 +63,20 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "assigned position in a list": (
         lambda: touched(mpm.Sphere((0.3, 0.3), 0.1), [wanted(0.3), 0.3]),
-        "position must be a number",
+        "position must be numbers or one tensor, got tensors in a list",
     ),
     "assigned size in a list": (
         lambda: sized(mpm.Box((0.3, 0.3), (0.1, 0.1)), [wanted(0.3), 0.3]),
         "size must be numbers or one tensor, got tensors in a list",
     ),
-    "position in a list": (lambda: mpm.Sphere([wanted(0.3), 0.3], 0.1), "position must be a number"),
-    "gravity in a list": (lambda: mpm.Step(GRID, LAW, [0.0, wanted(-9.8)]), "gravity must be a number"),
+    "position in a list": (
+        lambda: mpm.Sphere([wanted(0.3), 0.3], 0.1),
+        "position must be numbers or one tensor, got tensors in a list",
+    ),
+    "gravity in a list": (
+        lambda: mpm.Step(GRID, LAW, [0.0, wanted(-9.8)]),
+        "gravity must be numbers or one tensor, got tensors in a list",
+    ),
     "force in a list": (lambda: particle_operations.Push([wanted(1.0), 0.0]), "force must be a number"),
     "friction of walls": (lambda: mpm.Walls("slip", friction=wanted(0.5)), "use a Plane for friction with a gradient"),
     "flip": (lambda: mpm.Step(GRID, LAW, flip=wanted(0.5)), "flip must be a number"),

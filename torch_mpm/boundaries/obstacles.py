@@ -73,9 +73,10 @@ class Obstacle(RigidMotion):
         scene: it acts only in this scene of a batch; None for all.
 
     Parameters of shapes and obstacles have these forms, in a constructor, in an assignment, and as the result of a
-    function: a number; a tensor or an array [], [B], [D] or [B, D]; a list or tuple of D components, which are numbers,
-    or tensors and arrays [] or [B], and are stacked on the last axis; a list of B lists of D numbers, [B, D]. So two
-    arrays in a list are two components, and two lists in a list are two scenes.
+    function: a number; a tensor or an array [], [B], [D] or [B, D]; a list or tuple of D components, which are numbers
+    or arrays [] or [B], and are stacked on the last axis; a list of B lists of D numbers, [B, D]. So two arrays in a
+    list are two components, and two lists in a list are two scenes. In the result of a function, components may be
+    tensors too.
 
     All of these may be assigned between control steps: one is a call of a step, of `rollout`, `rollout_to` or
     `Environments.advance`, or the steps from one call of a hook to the next. A state stores where its steps have left

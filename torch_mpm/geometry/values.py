@@ -14,8 +14,10 @@ from ..cuda_graphs.capture import is_readable
 from ..errors import REAL, check_number, shape_of
 
 Value = float | Sequence[Any] | np.ndarray | Tensor
-"""A number; a tensor or an array [], [B], [D] or [B, D]; a list or tuple of D components, numbers or tensors and
-arrays [] or [B], which are stacked on the last axis; or a list of B lists of D numbers, [B, D]."""
+"""A number; a tensor or an array [], [B], [D] or [B, D]; a list or tuple of D components, numbers or arrays [] or [B],
+which are stacked on the last axis; or a list of B lists of D numbers, [B, D]. Results of functions may have tensors in
+the place of arrays; values that are stored may not: a stack of tensors would neither follow their writes nor a second
+backward pass."""
 
 
 def as_value(name: str, value: Any, like: Tensor | None = None) -> Any:
@@ -54,6 +56,11 @@ def as_value(name: str, value: Any, like: Tensor | None = None) -> Any:
 
 def _is_list(value: Any) -> bool:
     return isinstance(value, (list, tuple))
+
+
+def _has_tensors(value: Any) -> bool:
+    """Whether tensors are in a list."""
+    return _is_list(value) and any([isinstance(part, Tensor) or _has_tensors(part) for part in value])
 
 
 def _of_array(name: str, array: np.ndarray) -> Any:
@@ -136,6 +143,8 @@ def finite(name: str, value: Any, expected: str = "finite") -> Any:
     """Finite numbers, in their stored form; None unchanged."""
     if value is None:
         return None
+    if _has_tensors(value):
+        raise TypeError(f"{name} must be numbers or one tensor, got tensors in a list: stack them (torch.stack)")
     value = as_value(name, value)
     if isinstance(value, Tensor):
         if value.is_complex() or value.dtype == torch.bool:

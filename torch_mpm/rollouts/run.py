@@ -101,8 +101,8 @@ def rollout(
     if plan is not None:
         check_plan(plan, checkpoint=checkpoint, graph=graph, schedule=schedule)
         steps = _as_planned(steps, plan)
+    check_state(state)
     if truncate is None and hook is None and norms is None and prefix == 0 and every == 1 and every is not True:
-        check_state(state)
         with steps.call(state) as ended, steps.control(state) as left:
             return ended(left(_computed(steps, state, plan)))
     with steps.call(state) as ended:
