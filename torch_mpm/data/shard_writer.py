@@ -89,8 +89,8 @@ class ShardWriter:
     def finish(self) -> ShardRecord:
         """Write the rest of the shard and then its record; each appears when it is complete and on the disk.
 
-        A seal protects all but the numbers of the arrays, each of which has a checksum, so that a reader detects damage
-        before HDF5 meets it, without reading the whole shard.
+        Every array of numbers has a checksum. A seal, one more checksum, covers the rest of the file. A reader compares
+        the seal before HDF5 opens the file, and does not read the whole shard.
 
         Raises:
             OSError: for a full disk, among others.

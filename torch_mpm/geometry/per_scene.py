@@ -41,8 +41,7 @@ class SceneParameters(TensorModule):
         check = self.CHECKS.get(name)
         if check is not None:
             checked = check(name, value)
-            writable = isinstance(value, WRITABLE) and not isinstance(checked, Tensor)
-            value = value if writable else checked
+            value = value if isinstance(value, WRITABLE) else checked
         super().__setattr__(name, value)
 
     def value_of(self, name: str) -> Any:

@@ -148,10 +148,8 @@ class ImplicitSystem:
 
     def exceeds(self, v: Tensor, most: Tensor) -> Tensor:
         """Scenes in which the trial |F|² of a particle exceeds a limit [P], bool [B]."""
-        trial = self.trial(v)
-        if trial.F is None:
-            return torch.zeros(self.blocks.grid.scenes, dtype=torch.bool, device=v.device)
-        return self.particle_sum((trial.F.square().sum((1, 2)) > most).double()[:, None])[:, 0] > 0
+        exceeding = self.squared_stretch(self.trial(v)) > most
+        return self.particle_sum(exceeding.double()[:, None])[:, 0] > 0
 
     def gain(self, v: Tensor, residual: Tensor, trial: Tensor, change: Tensor) -> Tensor:
         """Change of E in a step from v, whose residual is given, to a trial, float64 [B] [J]; with plastic flow, which

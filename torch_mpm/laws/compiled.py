@@ -245,15 +245,12 @@ class CompiledLaw(Material):
 
     def is_all_of_its_update(self) -> bool:
         """Whether `update` equals the compiled law, so that a kernel may replace it."""
-        return self._updates_as_compiled()
+        return type(self).update is CompiledLaw.update
 
     def figures_are_compiled(self) -> bool:
         """Whether stress, stiffness and energy are those of the compiled law alone, which one op computes together."""
         own = (getattr(type(self), name) is getattr(CompiledLaw, name) for name in FIGURES)
-        return self._updates_as_compiled() and all(own)
-
-    def _updates_as_compiled(self) -> bool:
-        return type(self).update is CompiledLaw.update
+        return self.is_all_of_its_update() and all(own)
 
     @property
     def has_functions(self) -> bool:

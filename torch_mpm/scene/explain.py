@@ -69,7 +69,7 @@ def explain(error: ValidationError, root: type[BaseModel] = SceneData) -> list[s
 
 
 def _lacks_invalid_entries(item: Any) -> bool:
-    """Whether a list is too short only without its invalid entries, each of which is a problem of its own."""
+    """Whether a list has enough entries, but not enough valid ones. Each invalid entry is a problem of its own."""
     return bool(item["type"] == "too_short" and len(item["input"]) >= item["ctx"]["min_length"])
 
 
