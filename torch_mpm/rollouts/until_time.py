@@ -11,8 +11,8 @@ from torch import Tensor
 from ..boundaries.control import control_step
 from ..boundaries.motion import PACE
 from ..errors import NUMBER_OR_TENSOR, check_count, check_number, shape_of
+from ..ops.segment_clock import ALL_LEFT, SegmentClock, segment_clock
 from ..state.state import State
-from ..step.stability import chosen_dt
 from ..step.step import Step
 from .checkpoints import Checkpoints
 from .fused_op import in_calls
@@ -30,8 +30,6 @@ MOST_SUBSTEPS = 2**16
 """Substeps of a scene in a call: a scene whose limit shrinks without bound must not delay the others."""
 LEAST_REPLAYS = 3
 """Number of segments from which the capture of a graph pays."""
-ROUNDING = 1e-9
-"""Tolerance in the number of substeps, below which no additional one is computed."""
 
 
 class RolloutToResult(NamedTuple):
@@ -140,9 +138,9 @@ def _compensated(step: Step, state: State, cfl: float, longest: float) -> State:
 
 
 class Clocks:
-    """State with times and time steps per scene, float64 [B]: a float32 clock would not reach its end.
+    """State whose scenes have times and time steps of their own, in float64: a float32 clock would not reach its end.
 
-    Graphs read and write the tensors, so their addresses do not change.
+    Graphs read and write the table of the clocks, so its address does not change.
     """
 
     def __init__(
@@ -155,26 +153,25 @@ class Clocks:
         most: int,
         previous: float | Tensor | None,
     ) -> None:
-        self.step, self.state, self.cfl, self.longest, self.most = step, state, cfl, longest, most
-        self.end = _per_scene("time", time, step.grid.scenes, state.x)
-        self.now = _per_scene("the time of the state", state.time, step.grid.scenes, state.x)
-        self.substeps = torch.zeros_like(self.now, dtype=torch.int64)
-        self.largest_cfl = torch.zeros_like(self.now)
-        self.seconds: float | Tensor = (self.end - self.now).clamp(min=0)
-        """Remaining substeps at the beginning."""
+        self.step, self.state = step, state
+        self._limits = cfl, longest, most
+        end = _per_scene("time", time, step.grid.scenes, state.x)
+        now = _per_scene("the time of the state", state.time, step.grid.scenes, state.x)
+        latest = _per_scene("previous", 0.0 if previous is None else previous, step.grid.scenes, state.x)
+        self.seconds: float | Tensor = (end - now).clamp(min=0)
+        """Remaining time at the beginning [s]."""
         if not isinstance(time, Tensor) and not isinstance(state.time, Tensor):
             self.seconds = max(time - state.time, 0.0)
         self._end = time
-        self._bound = _per_scene("previous", 0.0 if previous is None else previous, step.grid.scenes, state.x)
-        self._dt = torch.zeros_like(self.now)
-        self._left = torch.zeros_like(self.substeps)  # Substeps until the end, at most `most`.
+        zero = torch.zeros_like(now)
+        self._table = torch.stack([now, end, latest, zero, zero, zero, zero, zero], 1)
+        self._clock = SegmentClock(*self._table.unbind(1))
 
     @torch.no_grad()
     def remaining(self) -> list[int]:
         """Distinct numbers of remaining substeps of the scenes, in ascending order; waits for the device."""
-        self.state = self._at_its_time(self.state)
-        self._choose(self.state)
-        return [count for count in self._left.unique().tolist() if count > 0]
+        self.state, _ = self._next(self.state, 0)
+        return [int(count) for count in self._clock.left.unique().tolist() if count > 0]
 
     def advance(self, segments: int, n: int, options: dict[str, Any]) -> None:
         """Segments of n substeps each, for scenes with more than n remaining substeps; options of `rollout`."""
@@ -194,12 +191,12 @@ class Clocks:
 
     def finish(self, counts: list[int], options: dict[str, Any]) -> None:
         """Last substeps of each scene, as counted by `remaining`; options of `rollout`."""
-        taken = 0
+        taken, clock = 0, self._clock
         for count in counts:
-            dt = torch.where(self._left >= count, self._dt, 0.0).to(self.state.x.dtype)
+            dt = torch.where(clock.left >= count, clock.step, 0.0).to(self.state.x.dtype)
             self.state = rollout(self.step, self.state, count - taken, dt, **options)
             taken = count
-        self._take(self._left)
+        self._update(None, ALL_LEFT)
 
     def _plan_of_replays(self, n: int, options: dict[str, Any]) -> RolloutPlan | None:
         """The plan of a segment that is replayed as a CUDA graph; None if it cannot be captured."""
@@ -208,7 +205,7 @@ class Clocks:
             return None
         given: RolloutPlan | None = options.get("plan")
         schedule = options.get("schedule") if given is None else given.schedule if given.forced else None
-        plan = plan_of_steps(Steps(step, n, self._dt.to(state.x.dtype), schedule=schedule), state)
+        plan = plan_of_steps(Steps(step, n, self._clock.step.to(state.x.dtype), schedule=schedule), state)
         if plan.executor != "fused" or plan.facts is None or plan.facts.gradients:
             return None
         return plan.of_sorted()  # or not worth a sort
@@ -217,52 +214,29 @@ class Clocks:
     def _next(self, state: State, n: int) -> tuple[State, Tensor]:
         """State at its time, and dt of its next n substeps: zero for scenes with at most n remaining."""
         state = self._at_its_time(state)
-        self._choose(state)
-        moves = self._left > n
-        self._take(torch.where(moves, n, 0))
-        return state, torch.where(moves, self._dt, 0.0).to(state.x.dtype)
-
-    @torch.no_grad()
-    def _take(self, count: Tensor) -> None:
-        """Count n substeps of each scene."""
-        span = self.end - self.now
-        arrives = (count > 0) & (count * self._dt >= span * (1 - ROUNDING))
-        self.now.copy_(torch.where(arrives, self.end, self.now + count * self._dt))
-        self.substeps += count
+        self._update(self._rate(state), n)
+        return state, self._clock.segment_step.to(state.x.dtype, copy=True)
 
     @torch.no_grad()
     def arrival(self) -> RolloutToResult:
+        clock = self._clock
         state = self._at_its_time(self.state)
-        self._limit(state)
-        arrived = self.now >= self.end
-        if not isinstance(self._end, Tensor) and bool((self.now == self.end).all()):
+        self._update(self._rate(state), 0, choose=False)
+        if not isinstance(self._end, Tensor) and bool((clock.now == clock.end).all()):
             state = state.replace(time=float(self._end))
-        return RolloutToResult(state, arrived, self.substeps, self.largest_cfl, self._bound)
+        return RolloutToResult(
+            state, clock.now >= clock.end, clock.substeps.long(), clock.largest_cfl.clone(), clock.latest.clone()
+        )
 
     def _at_its_time(self, state: State) -> State:
-        return state.replace(time=self.now.clone())
+        return state.replace(time=self._clock.now.clone())
 
-    def _limit(self, state: State) -> Tensor:
-        """Longest stable dt of each scene; the previous dt becomes a fraction of it."""
-        limit = 1 / self.step.stability_report(state, with_energy=False).rate
-        self._count_cfl(limit, self.substeps > 0)
-        return limit
+    def _rate(self, state: State) -> Tensor:
+        """1/dt of the stability limit of each scene [1/s]."""
+        return self.step.stability_report(state, with_energy=False).rate
 
-    def _count_cfl(self, limit: Tensor, moves: Tensor) -> None:
-        share = torch.where(moves, torch.nan_to_num(self._dt / limit, nan=0.0), 0.0)
-        self.largest_cfl.copy_(torch.maximum(self.largest_cfl, share))
-
-    def _choose(self, state: State) -> None:
-        """dt and number of substeps until its end for each scene; zero for scenes that have arrived or cannot."""
-        limit, span = self._limit(state), self.end - self.now
-        longest = (self.cfl * limit).clamp(max=self.longest)
-        bound = chosen_dt(longest, self._bound)
-        left = torch.ceil(span / bound * (1 - ROUNDING)).clamp(min=1)
-        moves = (span > 0) & span.isfinite() & (longest > 0) & (self.substeps < self.most)
-        self._bound.copy_(torch.where(moves, bound, self._bound))
-        self._dt.copy_(torch.where(moves, span / left, self._dt))
-        self._left.copy_(torch.where(moves, torch.minimum(left, self.most - self.substeps), 0.0))
-        self._count_cfl(limit, moves)
+    def _update(self, rate: Tensor | None, n: int, choose: bool = True) -> None:
+        self._table.copy_(segment_clock(self._table, rate, *self._limits, choose, n))
 
 
 def _per_scene(name: str, time: float | Tensor, scenes: int, like: Tensor) -> Tensor:
