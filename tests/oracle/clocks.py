@@ -17,12 +17,12 @@ def segment_clock(
 ) -> Tensor:
     c = SegmentClock(*table.clone().unbind(1))
 
-    def count_cfl(step: Tensor, where: Tensor) -> Tensor:
-        share = torch.nan_to_num(step * rate, nan=0.0, posinf=math.inf)
+    def count_cfl(rate: Tensor, where: Tensor) -> Tensor:
+        share = torch.nan_to_num(c.step * rate, nan=0.0, posinf=math.inf)
         return torch.where(where, torch.maximum(c.largest_cfl, share), c.largest_cfl)
 
     if rate is not None:
-        c = c._replace(largest_cfl=count_cfl(c.step, c.substeps > 0))
+        c = c._replace(largest_cfl=count_cfl(rate, c.substeps > 0))
     if rate is not None and choose:
         limit, span = (cfl / rate).clamp(max=longest), c.end - c.now
         latest = torch.where((limit / 2 <= c.latest) & (c.latest <= limit), c.latest, limit)
@@ -33,7 +33,7 @@ def segment_clock(
             step=torch.where(moves, span / left, c.step),
             left=torch.where(moves, torch.minimum(left, most - c.substeps), 0.0),
         )
-        c = c._replace(largest_cfl=count_cfl(c.step, moves))
+        c = c._replace(largest_cfl=count_cfl(rate, moves))
     count = c.left if substeps == ALL_LEFT else torch.where(c.left > substeps, float(substeps), 0.0)
     arrives = (count > 0) & (count * c.step >= (c.end - c.now) * (1 - TOLERANCE))
     c = c._replace(
