@@ -68,12 +68,24 @@ __global__ void __launch_bounds__(Law::gpu_threads)
   if (p < a.law.particles && a.law.members.has(p)) Law::template Kernels<Law>::energy_double_backward(a, One<T>{p});
 }
 
-// Entries of the history of a law, side by side.
+// Entries of the history of a law, side by side, if all of it is there.
 template <class Law, int D>
 constexpr int history_entries() {
   int entries = 0;
   for (const Quantity& variable : Law::history) entries += variable.matrix ? D * D : 1;
   return entries;
+}
+
+// The history variable of an entry.
+template <class Law, int D>
+constexpr int history_variable(int entry) {
+  int variable = 0;
+  for (const Quantity& q : Law::history) {
+    entry -= q.matrix ? D * D : 1;
+    if (entry < 0) break;
+    variable++;
+  }
+  return variable;
 }
 
 // Momentum of particles whose stress is computed as they are loaded, and stored where it has a destination. Where
@@ -152,7 +164,10 @@ struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true> {
     }
     if (!law.history.pointer) return;
 #pragma unroll
-    for (int k = 0; k < entries; k++) store_entry(One<T>{p}, law.history, k, changes.history[k]);
+    for (int k = 0; k < entries; k++) {  // options decide how much of its history a law has: the first variables
+      if (law.law.history[history_variable<Law, D>(k)].pointer)
+        store_entry(One<T>{p}, law.history, k, changes.history[k]);
+    }
   }
   __device__ Matrix<T, D> update(int p, const Matrix<T, D>& C, const T& dt) const {
     if constexpr (MayMove) {

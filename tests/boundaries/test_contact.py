@@ -280,7 +280,7 @@ def test_gradients_of_the_obstacle(device, dim, shape, kind, scenes):
         value = (after(blocks, velocity, [body, floor], time) * weight).sum()
         results.append(torch.autograd.grad(value, wanted, allow_unused=True, materialize_grads=True))
     for name, expected, grad in zip(("velocity", "mu", *leaves), *results, strict=True):
-        torch.testing.assert_close(grad, expected, rtol=1e-12, atol=1e-12, msg=lambda m, name=name: f"{name}: {m}")
+        torch.testing.assert_close(grad, expected, rtol=1e-10, atol=1e-10, msg=lambda m, name=name: f"{name}: {m}")
     assert all(grad.abs().max() > 0 for grad in results[1][2:4])  # position and velocity
 
 

@@ -113,4 +113,5 @@ def test_a_direction_given_once(device):
     for direction in (torch.tensor([0.6, 0.8], dtype=F64), torch.tensor([[0.6, 0.8]], dtype=F64)):
         step.law = mpm.Active(passive(), direction.to(device))
         ends.append((step.law.stress(state), mpm.rollout(step, state, 3, 1e-4).v))
-    assert all(torch.equal(a, b) for a, b in zip(*ends, strict=True))
+    for a, b in zip(*ends, strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=1e-12 * float(b.abs().max()))  # CUDA adds in any order
