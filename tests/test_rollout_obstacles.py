@@ -14,7 +14,7 @@ from torch import Tensor
 import torch_mpm as mpm
 from benchmarks.catalogue.scenes import blob, unit_box
 from torch_mpm.ops.contact import MAX_OBSTACLES
-from torch_mpm.rollouts import fused_op, plan
+from torch_mpm.rollouts import facts, fused_op
 
 F64, DT = torch.float64, 1e-4
 
@@ -134,7 +134,7 @@ def test_paths_in_calls_of_few_steps(monkeypatch, device):
     state, obstacles = blob(device), bodies(3, smooth(3, device))
     step = mpm.Step(unit_box(), mpm.NeoHookean(E=1e4, nu=0.3), boundaries=obstacles)
     expected, calls, whole = one_by_one(step, state, 17, DT), [], fused_op.substeps
-    monkeypatch.setattr(plan, "_path_bytes", lambda *_: 2**26 // 5)
+    monkeypatch.setattr(facts, "_path_bytes", lambda *_: 2**26 // 5)
     monkeypatch.setattr(fused_op, "substeps", lambda *a: calls.append(a[2]) or whole(*a))
     assert_equal(mpm.rollout(step, state, 17, DT), expected)
     assert calls == [5, 5, 5, 2]

@@ -59,7 +59,7 @@ def test_schedules_agree(law, transfer, walls, obstacles, device):
     for schedule in SCHEDULES:
         step, state = made(law, transfer, walls, obstacles, device)
         if not serves(schedule, device, law, transfer, walls):
-            with pytest.raises(ValueError, match=f"schedule must be one that supports the call, got {schedule}: .+"):
+            with pytest.raises(ValueError, match=f"^schedule must be one that supports the call, got {schedule}: .+"):
                 mpm.rollout(step, state, STEPS, DT, schedule=schedule)
             continue
         end = mpm.rollout(step, state, STEPS, DT, schedule=schedule)

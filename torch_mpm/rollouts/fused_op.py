@@ -22,7 +22,9 @@ from ..step.clocks import StepTimes, clocks, requires_grad, time_after
 from ..step.pause import paused
 from ..step.step import Step
 from .checkpoints import binomial, offloaded
-from .plan import SCHEDULES, RolloutPlan, differentiates, follows_paths, why_not_fused
+from .facts import differentiates, follows_paths
+from .plan import SCHEDULES, RolloutPlan
+from .reasons import why_not_fused
 from .sorting import STEPS_IN_ORDER, restore_order, sort_particles
 from .steps import Steps
 

@@ -20,7 +20,8 @@ from .gradient_norms import GradientNorms
 from .graph_replay import replayed
 from .graph_segments import graphed_steps
 from .hooks import Hook, Parts
-from .plan import RolloutPlan, check_plan, plan_of_steps, why_not_fused
+from .plan import RolloutPlan, check_plan, plan_of_steps
+from .reasons import why_not_fused
 from .steps import Steps
 
 

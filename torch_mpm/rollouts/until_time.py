@@ -15,9 +15,10 @@ from ..state.state import State
 from ..step.stability import chosen_dt
 from ..step.step import Step
 from .checkpoints import Checkpoints
+from .facts import facts_of, follows_paths
 from .fused_op import in_calls
 from .graph_replay import CHUNK, replay_all
-from .plan import RolloutPlan, check_plan, facts_of, follows_paths, plan_call, plan_of_steps
+from .plan import RolloutPlan, check_plan, plan_call, plan_of_steps
 from .run import rollout
 from .sorting import restore_order, sort_particles
 from .steps import Steps
