@@ -37,6 +37,7 @@ MOVED = {
     "pause": "step.pause",
     "per_scene": "geometry.per_scene",
     "point_files": "geometry.point_files",
+    "precision": "ops.precision",
     "recompute": "rollouts.recompute",
     "recording": "rollouts.frames",
     "recording_keys": "cuda_graphs.keys",
