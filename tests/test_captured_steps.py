@@ -17,6 +17,7 @@ from torch import nn
 
 import torch_mpm as mpm
 from benchmarks.catalogue.scenes import blob, unit_box
+from torch_mpm.cuda_graphs import graph as cuda_graph
 from torch_mpm.cuda_graphs.capture import CapturedGraphs
 from torch_mpm.rollouts import graph_segments
 from torch_mpm.step.status import uncounted
@@ -24,7 +25,7 @@ from torch_mpm.step.status import uncounted
 DT = 2e-4
 
 
-class Repeated(graph_segments.Graphs):
+class Repeated(cuda_graph.Graphs):
     """Imitation of a replay: arguments and results have fixed memory, and a backward pass overwrites its inputs."""
 
     def capture(self, beside):
@@ -38,12 +39,12 @@ class Repeated(graph_segments.Graphs):
 
     def forward(self, given):
         with torch.no_grad():
-            graph_segments.copy_all(self.read, given)
-        with graph_segments.no_hooks(), torch.set_grad_enabled(any(t.requires_grad for t in self.read)):
+            cuda_graph.copy_all(self.read, given)
+        with cuda_graph.no_hooks(), torch.set_grad_enabled(any(t.requires_grad for t in self.read)):
             self._now = self._steps(*self.read)
         Repeated.spoilt = None
         with torch.no_grad():
-            graph_segments.copy_all(self._ends, self._now)
+            cuda_graph.copy_all(self._ends, self._now)
         return self._ends
 
     def backward(self, grads):
@@ -60,7 +61,7 @@ class Repeated(graph_segments.Graphs):
 def captured(device, monkeypatch):
     """The graphs that are captured from here on."""
     made = []
-    base = graph_segments.Graphs if device == "cuda" else Repeated
+    base = cuda_graph.Graphs if device == "cuda" else Repeated
 
     class Counted(base):
         def capture(self, beside):
@@ -70,7 +71,7 @@ def captured(device, monkeypatch):
     monkeypatch.setattr(graph_segments, "Graphs", Counted)
     if device == "cpu":
         monkeypatch.setattr(graph_segments, "has_graphs", lambda device: True)
-        monkeypatch.setattr(graph_segments, "on_own_stream", lambda device: contextlib.nullcontext())
+        monkeypatch.setattr(cuda_graph, "on_own_stream", lambda device: contextlib.nullcontext())
     return made
 
 
