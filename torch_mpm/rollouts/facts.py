@@ -138,7 +138,7 @@ def wants_gradient(steps: Steps, state: State) -> bool:
 
 
 def differentiates(step: Step, state: State, dt: float | Tensor) -> bool:
-    """The same, without the results of functions of time."""
+    """`wants_gradient` without the gradients of functions of time."""
     return requires_grad(dt) or any([t.requires_grad for t in _differentiable(step, state)])
 
 

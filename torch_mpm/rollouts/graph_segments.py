@@ -128,8 +128,8 @@ class GraphedStep:
 
     def __call__(self, state: State) -> State:
         check_state(state)
-        with control_step(self._step, state, self._n, self._dt) as left:
-            return left(self.after(state, StepKey(self._step)))
+        with control_step(self._step, state, self._n, self._dt) as end_motion:
+            return end_motion(self.after(state, StepKey(self._step)))
 
     def capture(self, state: State) -> None:
         """Capture the steps for states like this one, in the current grad mode and autocast."""
@@ -239,7 +239,7 @@ class _Steps:
     @property
     def step(self) -> nn.Module:
         step = self._step()
-        assert step is not None, "its captured graphs go with a step"
+        assert step is not None, "captured graphs are deleted with their step"
         return step
 
     def __call__(self, *tensors: Tensor) -> tuple[Tensor, ...]:
@@ -279,7 +279,7 @@ class _Call:
             if self._graphs.latest is not self._mark:
                 with uncounted(self._step), self._same_random_numbers():
                     graphs.forward(given)
-            self._graphs.latest = None  # the backward pass overwrites its inputs
+            self._graphs.latest = None  # The backward pass overwrites its inputs.
             # The next replay overwrites its gradients.
             return [None if grad is None else grad.clone() for grad in graphs.backward(grads)]
 

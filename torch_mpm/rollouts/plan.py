@@ -14,7 +14,7 @@ from ..errors import check_count, shape_of
 from ..ops.arguments import check_choice, split_dt
 from ..state.state import State, check_state
 from ..step.step import Step
-from .budget import EVERYTHING, resolved, steps_of_a_call
+from .budget import EVERYTHING, steps_of_a_call, within_budget
 from .checkpoints import Checkpoints, as_checkpoints
 from .facts import Facts, facts_of
 from .reasons import why_not_fused, why_not_graphs, why_not_replay
@@ -55,8 +55,8 @@ def plan_call(schedule: str | None, facts: Facts) -> CallPlan:
     """
     number = -1 if schedule is None else SCHEDULES.index(schedule)
     chosen, blocks, steps, order, reasons = torch.ops.torch_mpm.plan_substeps(number, *facts)
-    against = tuple(tuple(line.split(": ", 1)) for line in reasons.splitlines())
-    return CallPlan(SCHEDULES[chosen], None if blocks < 0 else blocks, steps, order, against)
+    reasons_by_name = tuple(tuple(line.split(": ", 1)) for line in reasons.splitlines())
+    return CallPlan(SCHEDULES[chosen], None if blocks < 0 else blocks, steps, order, reasons_by_name)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -159,59 +159,61 @@ def plan_rollout(
     check_count("n", n)
     if graph is not None:
         check_count("graph", graph, 1)
-    kept = as_checkpoints(checkpoint)
+    checkpoints = as_checkpoints(checkpoint)
     check_state(state)
     if isinstance(step, Step):
         split_dt(dt, step.grid.scenes, state.x)
-    return plan_of_steps(Steps(step, n, dt, kept, graph, schedule), state)
+    return plan_of_steps(Steps(step, n, dt, checkpoints, graph, schedule), state)
 
 
 def plan_of_steps(steps: Steps, state: State) -> RolloutPlan:
     """`plan_rollout` for arguments that were checked."""
     if steps.schedule is not None:
         check_choice("schedule", steps.schedule, SCHEDULES)
-    no_op = why_not_fused(steps.step, state, steps.dt)
-    checkpoints = None if steps.checkpoints is None else _that_fit(steps, state, no_op is None)
-    if no_op is None:
+    against_fused = why_not_fused(steps.step, state, steps.dt)
+    checkpoints = None if steps.checkpoints is None else _checkpoints_that_fit(steps, state, against_fused is None)
+    if against_fused is None:
         return _fused(steps, state, checkpoints)
     if steps.schedule is not None:
         raise ValueError(
-            f"schedule must be None for steps that the fused op does not support, got {steps.schedule!r}: {no_op}"
+            f"schedule must be None for steps that the fused op does not support, got {steps.schedule!r}: "
+            f"{against_fused}"
         )
-    reasons = {"fused": no_op}
-    no_replay = why_not_replay(steps, state)
-    if no_replay is None:
+    reasons = {"fused": against_fused}
+    against_replay = why_not_replay(steps, state)
+    if against_replay is None:
         reasons |= {"graph": "replays of one step suffice without user functions", "loop": "a graph is faster"}
         return RolloutPlan("replay", None, 1, None, False, checkpoints, reasons)
-    reasons["replay"] = no_replay
-    no_graph = why_not_graphs(steps, state)
-    if no_graph is None and steps.graph is not None:
+    reasons["replay"] = against_replay
+    against_graph = why_not_graphs(steps, state)
+    if against_graph is None and steps.graph is not None:
         reasons["loop"] = "graphs are faster"
         return RolloutPlan("graph", None, max(min(steps.graph, steps.n), 1), None, False, checkpoints, reasons)
-    reasons["graph"] = no_graph or "rollout(graph=...) launches some steps as a graph"
+    reasons["graph"] = against_graph or "rollout(graph=...) launches some steps as a graph"
     return RolloutPlan("loop", None, 1, None, False, checkpoints, reasons)
 
 
-def _that_fit(steps: Steps, state: State, fused: bool) -> Checkpoints | None:
+def _checkpoints_that_fit(steps: Steps, state: State, fused: bool) -> Checkpoints | None:
     """Checkpoints without a budget of memory; `EVERYTHING` where all steps fit, None where nothing is stored."""
     if not torch.is_grad_enabled():
         return None
-    return resolved(steps, state, fused)
+    return within_budget(steps, state, fused)
 
 
 _INSTEAD = {name: "the op computes all steps" for name in ("replay", "graph", "loop")}
 
 
 def _fused(steps: Steps, state: State, checkpoints: Checkpoints | None) -> RolloutPlan:
+    """The plan for the fused op."""
     facts = facts_of(steps, state, checkpoints is EVERYTHING)
     plan = _planned(steps.schedule, facts)
     if checkpoints is None and not facts.gradients:
         return plan
-    together = plan.steps_per_call
+    steps_per_call = plan.steps_per_call
     if facts.gradients and checkpoints is not EVERYTHING:
         every = None if checkpoints is None else checkpoints.every
-        together = min(together, every or steps_of_a_call(state, steps.n))
-    return dataclasses.replace(plan, steps_per_call=together, checkpoints=checkpoints)
+        steps_per_call = min(steps_per_call, every or steps_of_a_call(state, steps.n))
+    return dataclasses.replace(plan, steps_per_call=steps_per_call, checkpoints=checkpoints)
 
 
 @functools.lru_cache(maxsize=1024)

@@ -133,7 +133,7 @@ def why_not_graphs(steps: Steps, state: State) -> str | None:
 
 
 _OWN = (DeviceConstantCache, CapturedGraphs, ErrorStatus, Grid)
-"""Made for graphs."""
+"""Types of the library that graphs support."""
 
 
 def _foreign(part: Any, device: torch.device, seen: list[Any]) -> str | None:

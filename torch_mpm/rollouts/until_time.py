@@ -121,13 +121,16 @@ def rollout_to(
     unsorted = plan_call(None, facts_of(Steps(step, 1, 1.0), given)._replace(steps=most)).order > 0
     start = sort_particles(step, given) if unsorted else given
     clocks = Clocks(step, start, time, cfl, longest, most, previous)
-    with step._error_status.call(state) as ended, control_step(step, start, most, PACE, clocks.seconds) as left:
+    with (
+        step._error_status.call(state) as end_call,
+        control_step(step, start, most, PACE, clocks.seconds) as end_motion,
+    ):
         while (counts := clocks.remaining()) and counts[-1] > every:
             clocks.advance(min((counts[-1] - 1) // every, MOST_SEGMENTS), every, options)
         clocks.finish(counts, options)
         arrival = clocks.arrival()
-        end = left(arrival.state)
-        return arrival._replace(state=ended(restore_order(step, end, start, given) if unsorted else end))
+        end = end_motion(arrival.state)
+        return arrival._replace(state=end_call(restore_order(step, end, start, given) if unsorted else end))
 
 
 def _compensated(step: Step, state: State, cfl: float, longest: float) -> State:
@@ -162,7 +165,7 @@ class Clocks:
         self.substeps = torch.zeros_like(self.now, dtype=torch.int64)
         self.largest_cfl = torch.zeros_like(self.now)
         self.seconds: float | Tensor = (self.end - self.now).clamp(min=0)
-        """Remaining substeps at the beginning."""
+        """Time to compute at the beginning [s]: a number, or [B] float64."""
         if not isinstance(time, Tensor) and not isinstance(state.time, Tensor):
             self.seconds = max(time - state.time, 0.0)
         self._end = time
@@ -174,7 +177,7 @@ class Clocks:
     def remaining(self) -> list[int]:
         """Distinct numbers of remaining substeps of the scenes, in ascending order; waits for the device."""
         self.state = self._at_its_time(self.state)
-        self._choose(self.state)
+        self._choose_dt(self.state)
         return [count for count in self._left.unique().tolist() if count > 0]
 
     def advance(self, segments: int, n: int, options: dict[str, Any]) -> None:
@@ -182,12 +185,12 @@ class Clocks:
         plan = self._plan_of_replays(n, options) if segments > LEAST_REPLAYS else None
         if plan is None:
             for _ in range(segments):
-                state, dt = self._next(self.state, n)
+                state, dt = self._begin_segment(self.state, n)
                 self.state = rollout(self.step, state, n, dt, **options)
             return
 
         def segment(state: State) -> State:
-            state, dt = self._next(state, n)
+            state, dt = self._begin_segment(state, n)
             return in_calls(Steps(self.step, n, dt), state, plan)
 
         # The first one allocates the status of steps.
@@ -195,12 +198,12 @@ class Clocks:
 
     def finish(self, counts: list[int], options: dict[str, Any]) -> None:
         """Last substeps of each scene, as counted by `remaining`; options of `rollout`."""
-        taken = 0
+        computed = 0
         for count in counts:
             dt = torch.where(self._left >= count, self._dt, 0.0).to(self.state.x.dtype)
-            self.state = rollout(self.step, self.state, count - taken, dt, **options)
-            taken = count
-        self._take(self._left)
+            self.state = rollout(self.step, self.state, count - computed, dt, **options)
+            computed = count
+        self._count_substeps(self._left)
 
     def _plan_of_replays(self, n: int, options: dict[str, Any]) -> RolloutPlan | None:
         """The plan of a segment that is replayed as a CUDA graph; None if it cannot be captured."""
@@ -212,20 +215,20 @@ class Clocks:
         plan = plan_of_steps(Steps(step, n, self._dt.to(state.x.dtype), schedule=schedule), state)
         if plan.executor != "fused" or plan.facts is None or plan.facts.gradients:
             return None
-        return plan.of_sorted()  # or not worth a sort
+        return plan.of_sorted()  # The particles are sorted, or sorting does not pay.
 
     @torch.no_grad()
-    def _next(self, state: State, n: int) -> tuple[State, Tensor]:
+    def _begin_segment(self, state: State, n: int) -> tuple[State, Tensor]:
         """State at its time, and dt of its next n substeps: zero for scenes with at most n remaining."""
         state = self._at_its_time(state)
-        self._choose(state)
+        self._choose_dt(state)
         moves = self._left > n
-        self._take(torch.where(moves, n, 0))
+        self._count_substeps(torch.where(moves, n, 0))
         return state, torch.where(moves, self._dt, 0.0).to(state.x.dtype)
 
     @torch.no_grad()
-    def _take(self, count: Tensor) -> None:
-        """Count n substeps of each scene."""
+    def _count_substeps(self, count: Tensor) -> None:
+        """Add `count` substeps of each scene to its number, and their time to its clock."""
         span = self.end - self.now
         arrives = (count > 0) & (count * self._dt >= span * (1 - ROUNDING))
         self.now.copy_(torch.where(arrives, self.end, self.now + count * self._dt))
@@ -233,6 +236,7 @@ class Clocks:
 
     @torch.no_grad()
     def arrival(self) -> RolloutToResult:
+        """The result, once no scene has substeps left."""
         state = self._at_its_time(self.state)
         self._limit(state)
         arrived = self.now >= self.end
@@ -253,7 +257,7 @@ class Clocks:
         share = torch.where(moves, torch.nan_to_num(self._dt / limit, nan=0.0), 0.0)
         self.largest_cfl.copy_(torch.maximum(self.largest_cfl, share))
 
-    def _choose(self, state: State) -> None:
+    def _choose_dt(self, state: State) -> None:
         """dt and number of substeps until its end for each scene; zero for scenes that have arrived or cannot."""
         limit, span = self._limit(state), self.end - self.now
         longest = (self.cfl * limit).clamp(max=self.longest)
