@@ -19,6 +19,7 @@ import torch_mpm as mpm
 from benchmarks.catalogue.scenes import blob, unit_box
 from torch_mpm.cuda_graphs import graph as cuda_graph
 from torch_mpm.cuda_graphs.capture import CapturedGraphs
+from torch_mpm.grid.topology import Status
 from torch_mpm.rollouts import graph_segments
 from torch_mpm.step.status import uncounted
 
@@ -205,7 +206,7 @@ def test_values_and_gradients_are_those_of_single_steps(make, device, captured):
             for s in (step, again):
                 for p in (t for t in (*s.parameters(), *s.buffers()) if t.requires_grad):
                     p.mul_(0.9)
-        assert int(step.status[0, 5]) == int(again.status[0, 5]) == 11 * (k + 1)
+        assert int(step.status[0, Status.ACTIVATIONS]) == int(again.status[0, Status.ACTIVATIONS]) == 11 * (k + 1)
     assert len(captured) == 2
     with torch.no_grad():
         assert_equal(mpm.rollout(step, state, 7, DT, graph=3), one_by_one(again, state, 7, DT))
@@ -250,7 +251,7 @@ def test_with_checkpoints_and_hooks(options, device, captured):
     take = lambda step, state, n, dt: mpm.rollout(step, state, n, dt, **options)  # noqa: E731
     assert_alike(trained(step, state, 13, in_graphs_of(2, **options)), trained(again, state, 13, take))
     assert captured
-    assert int(step.status[0, 5]) == int(again.status[0, 5]) == 13
+    assert int(step.status[0, Status.ACTIVATIONS]) == int(again.status[0, Status.ACTIVATIONS]) == 13
 
 
 def test_frames_pass_it_on(device, captured):
@@ -538,7 +539,7 @@ def test_a_step_that_was_moved_is_captured(device, captured):
         state = step(state, DT)
         step, state = step.to(device), state.to(device)
         mpm.rollout(step, state, 4, DT, graph=2)
-    assert step.status.device.type == torch.device(device).type and int(step.status[0, 5]) == 5
+    assert step.status.device.type == torch.device(device).type and int(step.status[0, Status.ACTIVATIONS]) == 5
 
 
 # ---- what does not go into a graph
