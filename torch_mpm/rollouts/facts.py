@@ -95,7 +95,7 @@ def facts_of(steps: Steps, state: State, stores_all: bool = False) -> Facts:
         gradients and stores_all and state.impulse is None and len(state) > 0,
         is_captured(x),
         x.is_cuda and graph_loops(),
-        _path_bytes(step, state, dt) if step.boundaries.entries else 0,
+        _path_bytes(step, steps, state) if step.boundaries.entries else 0,
         len(step.boundaries.entries),
     )
 
@@ -108,12 +108,12 @@ def _is_uniform(law: Any) -> bool:
     return all(v.numel() == 1 for v in part.values() if isinstance(v, Tensor))
 
 
-def _path_bytes(step: Step, state: State, dt: float | Tensor) -> int:
+def _path_bytes(step: Step, steps: Steps, state: State) -> int:
     """Size of the table of obstacles on paths, per step [bytes]; zero without such obstacles, and with shapes that have
     no entry in a table."""
     if not follows_paths(step) or any(o.shape.number is None for o in _obstacles(step)):
         return 0
-    clocks_of_scenes = isinstance(dt, Tensor) or isinstance(state.time, Tensor)
+    clocks_of_scenes = isinstance(steps.dt, Tensor) or isinstance(state.time, Tensor)
     numbers = numbers_of_a_step(_obstacles(step), state.x, step.grid.scenes if clocks_of_scenes else 1)
     return numbers * state.x.element_size()
 

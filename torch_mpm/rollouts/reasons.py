@@ -83,18 +83,18 @@ def _why_not_eager(x: Tensor) -> str | None:
     return "anomaly detection inspects every step" if detecting() else None
 
 
-def _why_no_graph(step: nn.Module, state: State, dt: float | Tensor) -> str | None:
-    """Reason why steps cannot be captured in CUDA graphs."""
-    if isinstance(dt, Tensor):
+def _why_not_captured(step: nn.Module, steps: Steps, state: State) -> str | None:
+    """Reason why steps of a module cannot be captured in CUDA graphs; None if they can."""
+    if isinstance(steps.dt, Tensor):
         return "dt is a tensor"
     if (reason := _why_not_eager(state.x)) is not None:
         return reason
     if any(has_hooks(module) for module in step.modules()):
         return "there are hooks"
-    steps = [module for module in step.modules() if isinstance(module, Step)]
-    if any(part.integrator is not None for part in steps):
+    parts = [module for module in step.modules() if isinstance(module, Step)]
+    if any(part.integrator is not None for part in parts):
         return "an implicit step waits for its solve"
-    if any(part.heat is not None and part.heat.method == "multigrid" for part in steps):
+    if any(part.heat is not None and part.heat.method == "multigrid" for part in parts):
         return "multigrid computes its largest number of iterations in a graph"
     return None
 
@@ -107,7 +107,7 @@ def why_not_replay(steps: Steps, state: State) -> str | None:
         return "it is not a plain Step"
     if not state.x.is_cuda:
         return "there are no graphs on the CPU"
-    if (reason := _why_no_graph(step, state, steps.dt)) is not None:
+    if (reason := _why_not_captured(step, steps, state)) is not None:
         return reason
     if isinstance(state.time, Tensor):
         return "the time of the state is a tensor"
@@ -125,7 +125,7 @@ def why_not_graphs(steps: Steps, state: State) -> str | None:
         return "it is no module"
     if not graph_segments.has_graphs(state.x.device):
         return "there are no graphs on the CPU"
-    if (reason := _why_no_graph(step, state, steps.dt)) is not None:
+    if (reason := _why_not_captured(step, steps, state)) is not None:
         return reason
     if (place := graph_segments.another_device(step, state.x.device)) is not None:
         return f"a tensor of it is on {place}, the particles on {state.x.device}"
