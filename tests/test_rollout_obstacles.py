@@ -205,10 +205,10 @@ def test_a_time_is_reached_beside_a_path(device):
 @pytest.mark.parametrize("clocks", [False, True])
 def test_a_path_is_asked_where_the_obstacle_is(clocks, device):
     """A table of a time between start and end alone; clocks of scenes are known to the device."""
-    asked = []
+    times = []
 
     def path(t: Tensor) -> Tensor:
-        asked.append(t)
+        times.append(t)
         return torch.stack([0.5 + 0 * t, 0.4 + 20 * (t - 3e-4), 0.5 + 0 * t], -1)
 
     state = blob(device)
@@ -218,9 +218,9 @@ def test_a_path_is_asked_where_the_obstacle_is(clocks, device):
     )
     assert in_one_op(step, state)
     expected = one_by_one(step, state, 10, DT)
-    asked.clear()
+    times.clear()
     assert_equal(mpm.rollout(step, state, 10, DT).replace(time=0.0), expected.replace(time=0.0))
-    assert len(asked) == 3  # once to differentiate it, and once to difference it
+    assert len(times) == 3  # once to differentiate it, and once to difference it
 
 
 def test_a_path_has_no_gradient_where_the_obstacle_is_not(device):
