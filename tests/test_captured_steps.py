@@ -17,14 +17,16 @@ from torch import nn
 
 import torch_mpm as mpm
 from benchmarks.catalogue.scenes import blob, unit_box
+from torch_mpm.cuda_graphs import graph as cuda_graph
 from torch_mpm.cuda_graphs.capture import CapturedGraphs
+from torch_mpm.grid.topology import Status
 from torch_mpm.rollouts import graph_segments
 from torch_mpm.step.status import uncounted
 
 DT = 2e-4
 
 
-class Repeated(graph_segments.Graphs):
+class Repeated(cuda_graph.Graphs):
     """Imitation of a replay: arguments and results have fixed memory, and a backward pass overwrites its inputs."""
 
     def capture(self, beside):
@@ -38,12 +40,12 @@ class Repeated(graph_segments.Graphs):
 
     def forward(self, given):
         with torch.no_grad():
-            graph_segments.copy_all(self.read, given)
-        with graph_segments.no_hooks(), torch.set_grad_enabled(any(t.requires_grad for t in self.read)):
+            cuda_graph.copy_all(self.read, given)
+        with cuda_graph.no_hooks(), torch.set_grad_enabled(any(t.requires_grad for t in self.read)):
             self._now = self._steps(*self.read)
         Repeated.spoilt = None
         with torch.no_grad():
-            graph_segments.copy_all(self._ends, self._now)
+            cuda_graph.copy_all(self._ends, self._now)
         return self._ends
 
     def backward(self, grads):
@@ -60,7 +62,7 @@ class Repeated(graph_segments.Graphs):
 def captured(device, monkeypatch):
     """The graphs that are captured from here on."""
     made = []
-    base = graph_segments.Graphs if device == "cuda" else Repeated
+    base = cuda_graph.Graphs if device == "cuda" else Repeated
 
     class Counted(base):
         def capture(self, beside):
@@ -70,7 +72,7 @@ def captured(device, monkeypatch):
     monkeypatch.setattr(graph_segments, "Graphs", Counted)
     if device == "cpu":
         monkeypatch.setattr(graph_segments, "has_graphs", lambda device: True)
-        monkeypatch.setattr(graph_segments, "on_own_stream", lambda device: contextlib.nullcontext())
+        monkeypatch.setattr(cuda_graph, "on_own_stream", lambda device: contextlib.nullcontext())
     return made
 
 
@@ -204,7 +206,7 @@ def test_values_and_gradients_are_those_of_single_steps(make, device, captured):
             for s in (step, again):
                 for p in (t for t in (*s.parameters(), *s.buffers()) if t.requires_grad):
                     p.mul_(0.9)
-        assert int(step.status[0, 5]) == int(again.status[0, 5]) == 11 * (k + 1)
+        assert int(step.status[0, Status.ACTIVATIONS]) == int(again.status[0, Status.ACTIVATIONS]) == 11 * (k + 1)
     assert len(captured) == 2
     with torch.no_grad():
         assert_equal(mpm.rollout(step, state, 7, DT, graph=3), one_by_one(again, state, 7, DT))
@@ -249,7 +251,7 @@ def test_with_checkpoints_and_hooks(options, device, captured):
     take = lambda step, state, n, dt: mpm.rollout(step, state, n, dt, **options)  # noqa: E731
     assert_alike(trained(step, state, 13, in_graphs_of(2, **options)), trained(again, state, 13, take))
     assert captured
-    assert int(step.status[0, 5]) == int(again.status[0, 5]) == 13
+    assert int(step.status[0, Status.ACTIVATIONS]) == int(again.status[0, Status.ACTIVATIONS]) == 13
 
 
 def test_frames_pass_it_on(device, captured):
@@ -537,7 +539,7 @@ def test_a_step_that_was_moved_is_captured(device, captured):
         state = step(state, DT)
         step, state = step.to(device), state.to(device)
         mpm.rollout(step, state, 4, DT, graph=2)
-    assert step.status.device.type == torch.device(device).type and int(step.status[0, 5]) == 5
+    assert step.status.device.type == torch.device(device).type and int(step.status[0, Status.ACTIVATIONS]) == 5
 
 
 # ---- what does not go into a graph

@@ -9,6 +9,7 @@ from cases.rollouts import F64, LAWS_HERE, assert_equal, one_by_one, tensors
 
 import torch_mpm as mpm
 from benchmarks.catalogue.scenes import blob, unit_box
+from torch_mpm.grid.topology import Status
 
 DT = 2e-4
 
@@ -61,7 +62,7 @@ def test_replays_are_single_steps(make, dim):
         assert_equal(end, one_by_one(again, state, 32, DT))
         step.check()
         again.check()
-        assert int(step.status[0, 5]) == int(again.status[0, 5]) == 32
+        assert int(step.status[0, Status.ACTIVATIONS]) == int(again.status[0, Status.ACTIVATIONS]) == 32
         assert str(step.failures(end)) == str(again.failures(end))
 
 

@@ -15,7 +15,8 @@ from torch_mpm._moved import MOVED, RENAMED
 def test_old_import_paths(old, monkeypatch):
     name = f"torch_mpm.{old}"
     monkeypatch.delitem(sys.modules, name, raising=False)
-    monkeypatch.delitem(vars(mpm), old, raising=False)
+    package, _, module = name.rpartition(".")
+    monkeypatch.delitem(vars(importlib.import_module(package)), module, raising=False)
     new = importlib.import_module(f"torch_mpm.{MOVED[old]}")
     with pytest.warns(DeprecationWarning, match=f"{name} has moved to {new.__name__}"):
         module = importlib.import_module(name)

@@ -35,6 +35,7 @@ from torch import Tensor
 
 import torch_mpm as mpm
 from benchmarks.catalogue.scenes import blob, touched, unit_box
+from torch_mpm.grid.topology import Status
 from torch_mpm.ops.contact import obstacle_arguments
 from torch_mpm.ops.grid_update import wall_arguments
 from torch_mpm.rollouts import budget, fused_op
@@ -210,7 +211,7 @@ def test_the_status_goes_on_from_call_to_call_of_recorded_steps(device):
     x = middle.x.clone()
     x[4] = 7.0
     mpm.rollout(step, middle.replace(x=x), 3, DT, checkpoint=ALL)
-    assert int(step.status[0, 5]) == 6
+    assert int(step.status[0, Status.ACTIVATIONS]) == 6
     with pytest.raises(mpm.SimulationError, match="step 3"):
         step.check()
 

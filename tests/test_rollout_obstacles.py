@@ -14,7 +14,7 @@ from torch import Tensor
 import torch_mpm as mpm
 from benchmarks.catalogue.scenes import blob, unit_box
 from torch_mpm.ops.contact import MAX_OBSTACLES
-from torch_mpm.rollouts import fused_op, plan
+from torch_mpm.rollouts import facts, fused_op
 
 F64, DT = torch.float64, 1e-4
 
@@ -134,7 +134,7 @@ def test_paths_in_calls_of_few_steps(monkeypatch, device):
     state, obstacles = blob(device), bodies(3, smooth(3, device))
     step = mpm.Step(unit_box(), mpm.NeoHookean(E=1e4, nu=0.3), boundaries=obstacles)
     expected, calls, whole = one_by_one(step, state, 17, DT), [], fused_op.substeps
-    monkeypatch.setattr(plan, "_path_bytes", lambda *_: 2**26 // 5)
+    monkeypatch.setattr(facts, "_path_bytes", lambda *_: 2**26 // 5)
     monkeypatch.setattr(fused_op, "substeps", lambda *a: calls.append(a[2]) or whole(*a))
     assert_equal(mpm.rollout(step, state, 17, DT), expected)
     assert calls == [5, 5, 5, 2]
@@ -205,10 +205,10 @@ def test_a_time_is_reached_beside_a_path(device):
 @pytest.mark.parametrize("clocks", [False, True])
 def test_a_path_is_asked_where_the_obstacle_is(clocks, device):
     """A table of a time between start and end alone; clocks of scenes are known to the device."""
-    asked = []
+    times = []
 
     def path(t: Tensor) -> Tensor:
-        asked.append(t)
+        times.append(t)
         return torch.stack([0.5 + 0 * t, 0.4 + 20 * (t - 3e-4), 0.5 + 0 * t], -1)
 
     state = blob(device)
@@ -218,9 +218,9 @@ def test_a_path_is_asked_where_the_obstacle_is(clocks, device):
     )
     assert in_one_op(step, state)
     expected = one_by_one(step, state, 10, DT)
-    asked.clear()
+    times.clear()
     assert_equal(mpm.rollout(step, state, 10, DT).replace(time=0.0), expected.replace(time=0.0))
-    assert len(asked) == 3  # once to differentiate it, and once to difference it
+    assert len(times) == 3  # once to differentiate it, and once to difference it
 
 
 def test_a_path_has_no_gradient_where_the_obstacle_is_not(device):

@@ -22,6 +22,7 @@ from torch import Tensor
 
 import torch_mpm as mpm
 from benchmarks.catalogue.scenes import blob, touched, unit_box
+from torch_mpm.grid.topology import Status
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -207,7 +208,7 @@ def test_a_pool_that_was_too_small_for_some_steps_is_told_when_it_has_grown(devi
             state = step(state.replace(v=torch.zeros_like(state.v)), 2e-5)
     if device == "cpu":
         return step.check(state)
-    assert step.grid.max_blocks > int(step.status[0, 7])
+    assert step.grid.max_blocks > int(step.status[0, Status.BLOCKS_NOW])
     with pytest.raises(mpm.GridOverflowError, match="more than the pool of the grid had room for in some steps"):
         step.check(state)
 

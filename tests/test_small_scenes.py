@@ -10,6 +10,7 @@ from helpers import relative_error
 
 import torch_mpm as mpm
 from benchmarks.catalogue.scenes import block_state
+from torch_mpm.grid.topology import Status
 
 
 def make(dim, scenes, law, dx=0.1, **options):
@@ -55,8 +56,8 @@ def test_a_scene_that_flies_apart(dim, device):
     step, single = (make(dim, 2, "water", dx=dx, grid={"deterministic": True, "max_blocks": 3000}) for _ in range(2))
     end, expected = both(step, single, state, 40, 2.5e-4)
     step.check(end)
-    assert int(single.status[0, 0]) > blocks  # wanted at most
-    assert torch.equal(step.status[0, 7], single.status[0, 7])  # and by the last step
+    assert int(single.status[0, Status.BLOCKS_WANTED]) > blocks  # wanted at most
+    assert torch.equal(step.status[0, Status.BLOCKS_NOW], single.status[0, Status.BLOCKS_NOW])  # and by the last step
     assert_same(end, expected, 1e-3)
 
 
@@ -99,7 +100,7 @@ def test_particles_that_leave_on_the_way(deterministic, device):
     step, single = make(2, 3, "neo_hookean", grid=grid), make(2, 3, "neo_hookean", grid=grid)
     end, expected = both(step, single, state)
     assert torch.equal(step.status[:, 1:], single.status[:, 1:])
-    assert torch.equal(step.status[1:, 0], single.status[1:, 0])
+    assert torch.equal(step.status[1:, Status.BLOCKS_WANTED], single.status[1:, Status.BLOCKS_WANTED])
     there = expected.x.isfinite().all(1)
     assert torch.equal(end.x.isfinite().all(1), there) and torch.equal(end.v.isfinite(), expected.v.isfinite())
     assert relative_error(end.x[there].double(), expected.x[there]) < 2e-5

@@ -8,6 +8,7 @@ from oracle import transfer as reference
 
 import torch_mpm as mpm
 from benchmarks.catalogue.scenes import block_state, make_step
+from torch_mpm.grid.topology import Status
 
 
 def mpm88(device):
@@ -69,7 +70,7 @@ def test_a_step_that_was_moved_goes_on(device, many):
         step, state = step.to(device), state.to(device)
         state = mpm.rollout(step, state, 5, 1e-3) if many else step(state, 1e-3)
     assert state.x.device.type == step.status.device.type == torch.device(device).type
-    assert int(step.status[0, 5]) == (6 if many else 2)
+    assert int(step.status[0, Status.ACTIVATIONS]) == (6 if many else 2)
 
 
 def test_free_fall_is_exact(device, dim):
@@ -481,7 +482,7 @@ def test_replays_of_a_graph_are_watched(inference):
         for _ in range(3):
             graph.replay()
         step.check()
-        activations = [status[0, 5].item() for status in step._error_status.all()]
+        activations = [status[0, Status.ACTIVATIONS].item() for status in step._error_status.all()]
         assert activations == [2, 7]  # of eager steps, and with replays
         inside = static.x[5].clone()
         static.x[5] = -9.0

@@ -7,7 +7,7 @@ from torch_mpm.render.viewer_server import is_own_page, viser_server
 
 
 @pytest.mark.parametrize(
-    ("origin", "asked", "host", "own"),
+    ("origin", "requested", "host", "own"),
     [
         (None, "127.0.0.1:8080", "127.0.0.1", True),
         ("http://127.0.0.1:8080", "127.0.0.1:8080", "127.0.0.1", True),
@@ -22,8 +22,8 @@ from torch_mpm.render.viewer_server import is_own_page, viser_server
         ("http://evil.example", "machine.example:8080", "0.0.0.0", False),
     ],
 )
-def test_pages_of_the_server(origin, asked, host, own):
-    assert is_own_page(origin, asked, host) == own
+def test_pages_of_the_server(origin, requested, host, own):
+    assert is_own_page(origin, requested, host) == own
 
 
 def test_pages_of_other_sites_cannot_connect():

@@ -22,6 +22,7 @@ MOVED = {
     "cfl": "step.stability",
     "checkpoints": "rollouts.checkpoints",
     "containers": "state.pytree",
+    "data.recording": "data.frame_transfer",
     "environments": "rollouts.environments",
     "failures": "step.failures",
     "gradient_norms": "rollouts.gradient_norms",
@@ -37,12 +38,14 @@ MOVED = {
     "pause": "step.pause",
     "per_scene": "geometry.per_scene",
     "point_files": "geometry.point_files",
+    "precision": "ops.precision",
     "recompute": "rollouts.recompute",
     "recording": "rollouts.frames",
     "recording_keys": "cuda_graphs.keys",
     "resolution": "grid.resolution",
     "rollout_estimate": "rollouts.estimate",
     "rollout_parts": "rollouts.hooks",
+    "scene.checkpoint": "state.state_file",
     "seed": "geometry.seed",
     "shapes": "geometry.shapes",
     "step_cost": "rollouts.memory",
@@ -64,7 +67,7 @@ class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
     """Imports the modules of the new paths under the old ones."""
 
     def find_spec(self, name: str, path: Any = None, target: Any = None) -> importlib.machinery.ModuleSpec | None:
-        package, _, old = name.rpartition(".")
+        package, _, old = name.partition(".")
         if package == PACKAGE and old in REMOVED:
             raise ModuleNotFoundError(f"{name} is not part of the package: {REMOVED[old]}", name=name)
         return importlib.machinery.ModuleSpec(name, self) if package == PACKAGE and old in MOVED else None
@@ -73,7 +76,7 @@ class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         return None
 
     def exec_module(self, module: types.ModuleType) -> None:
-        new = f"{PACKAGE}.{MOVED[module.__name__.rpartition('.')[2]]}"
+        new = f"{PACKAGE}.{MOVED[module.__name__.partition('.')[2]]}"
         warnings.warn(f"{module.__name__} has moved to {new}", DeprecationWarning, stacklevel=2)
         target = importlib.import_module(new)
         sys.modules[module.__name__] = target  # The import returns this entry.

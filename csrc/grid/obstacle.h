@@ -116,7 +116,7 @@ struct ObstaclePose {
   Matrix<S, D> rotation;  // world = centre + rotation body
 };
 
-// Many substeps of one call cannot tell a kernel that a graph replays which of them it is in: it counts activations.
+// Step of a call of many substeps, by the count of activations: a kernel that a graph replays has the same arguments.
 template <class T, int D>
 MPM_HD int step_of_call(const ContactArguments<T, D>& a) {
   return *a.activations - 1 - (a.activations_before ? *a.activations_before : 0);

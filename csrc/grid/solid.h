@@ -221,7 +221,7 @@ struct Foot {
   T depth = T(0);         // rounded
 };
 
-// A depth in steps of 1e-4 cells, so that rounding does not tell apart what is equally deep.
+// A depth in steps of 1e-4 cells, so that rounding does not distinguish equal depths.
 template <class T, int D>
 MPM_HD T rounded_depth(const ContactArguments<T, D>& a, const T& depth) {
   return std::floor(depth * T(1e4 / a.dx) + T(0.5));
@@ -292,7 +292,7 @@ class SolidAt {
   MPM_HD static T rounded_component(const T& x) { return std::floor(x * T(1000) + T(0.5)); }
 
   // The next set of faces, in the order of their number, of the deepest one, the second one and so on. Sets whose
-  // deepest face is deeper than the best foot are left out.
+  // deepest face is deeper than the best foot are skipped.
   MPM_HD bool next_set(Foot<T, D>& foot) const {
     int at = 0;
     while (at < foot.count && foot.member[at] + 1 == (at + 1 < foot.count ? foot.member[at + 1] : faces_.count)) at++;
@@ -611,7 +611,7 @@ class SolidAt {
     if (best_.count == 0 || foot.depth < best_.depth || comes_first(foot)) best_ = foot;
   }
 
-  // Whether a foot as deep as the best one comes first, whatever the order of obstacles and outlines: by the number of
+  // Whether a foot as deep as the best one comes first in any order of obstacles and outlines: by the number of
   // its faces, by the strictest of their kinds, by their largest friction, and by where it leads.
   MPM_HD bool comes_first(const Foot<T, D>& foot) const {
     if (foot.count != best_.count) return foot.count > best_.count;

@@ -71,8 +71,8 @@ constexpr int64_t kMostLateParticles = 1 << 18;
 
 // Persistent. For a deterministic grid, or a pool of fixed size, half as many particles.
 constexpr int64_t kLeastPersistentSteps = 10, kMostPersistentParticles = 1 << 15, kMostPersistentBlocks = 256;
-// Particles in 3-D with several obstacles. Nodes of more look for obstacles between two barriers, for longer than
-// kernels per step take, where nodes look for them during P2G.
+// Particles in 3-D with several obstacles. Nodes of more search for obstacles between two barriers, for longer than
+// kernels per step take, where nodes search for them during P2G.
 constexpr int64_t kMostAmongObstacles = 1 << 12;
 // Largest number of particles of an item, with a thread each. It grows with the number of particles, so that one wave
 // of thread blocks suffices for all items.

@@ -130,7 +130,7 @@ class Recorded {
 
   void lay_out(Arena& arena);
   Grid grid_in(Arena& arena, const Tensor& nodes) const;
-  // Blocks and nodes of a step, made on demand: making those of many steps at once would keep the device waiting.
+  // Blocks and nodes of a step, made on demand: making those of many steps at once would delay the device.
   Grid grid(int64_t i) const {
     Arena arena = grids_;
     arena.skip(i * grid_size_);

@@ -18,7 +18,7 @@
 // buffers that belong to the call. Shared by the ops of rollouts.
 namespace mpm {
 
-// As a growing grid does in torch_mpm/grid/grid.py.
+// Size of a pool with headroom, as for a growing grid in torch_mpm/grid/grid.py.
 inline int64_t with_headroom(int64_t blocks) { return blocks + blocks / 2 + 16; }
 
 // The activation and the nodes, for one size of the pool of blocks.
@@ -34,7 +34,7 @@ struct Pool {
     if (obstacles) velocity = empty(x, nodes_shape(a));
   }
 
-  // By ints(shape) and numbers(shape); the nodes and the workspace are given.
+  // Tensors are made by ints(shape) and numbers(shape); the nodes and the workspace are given.
   template <class Ints, class Numbers>
   void lay_out(const Tensor& given, ActivateArguments<T, D>& a, bool obstacles, const Ints& ints,
                const Numbers& numbers) {
@@ -171,7 +171,7 @@ struct Substeps {
     return a;
   }
 
-  // After G2P.
+  // Adds the share of FLIP to the velocities after G2P.
   void add_flip(const Field<const T>& velocities, backend::Stream stream) {
     const Field<T>& v = advance.gather.value;
     backend::add_scaled(AddScaledArguments<T, D>{in.x.size(0), v, constant(v), velocities, in.flip}, stream);
@@ -219,7 +219,7 @@ struct Substeps {
     advance.loads_ahead = true;
     for (LawUpdateArguments<T, D>& law : laws) law.runs_beside = !law.adds;
     next.particles = in.x.size(0);
-    next.obstacles = obstacles && !impulse.defined();  // whose impulses want the velocities before contact
+    next.obstacles = obstacles && !impulse.defined();  // impulses need the velocities before contact
     const int64_t most = std::min<int64_t>(update.block_count, INT32_MAX / kBlockNodes<D> - activation.max_blocks);
     activation.margin_blocks = int(std::clamp<int64_t>(activation.max_blocks / 2 + 64, 0, std::max<int64_t>(most, 0)));
   }
@@ -303,7 +303,7 @@ struct Substeps {
     backend::advance_clocks(AdvanceClocksArguments<T, D>{times, scene_dt, in.dt, in.scenes}, stream);
   }
 
-  // From the stress, which may be computed by P2G, to the velocities of the nodes.
+  // Computes the velocities of the nodes from the stress; P2G may compute the stress itself.
   void move_grid(backend::Stream stream) {
     clear_nodes(stream);
     if (fused)
@@ -323,7 +323,7 @@ struct Substeps {
 #endif
   }
 
-  // From their momenta to their velocities.
+  // Computes the velocities of the nodes from their momenta.
   void move_nodes(backend::Stream stream) {
     if (impulse.defined() && !in.wall_kind.empty()) backend::wall_impulses(wall_impulses(), stream);
     update_grid(stream);
@@ -332,7 +332,7 @@ struct Substeps {
     backend::contact(contact, stream);
   }
 
-  // With contact on CUDA, if activations last.
+  // Grid update; on CUDA with contact, if an activation serves several substeps.
   void update_grid(backend::Stream stream) {
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda
     if (displacements.defined()) {

@@ -57,7 +57,7 @@ std::optional<Results> run_recorded(const SubstepsInputs& in, backend::Stream st
 
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
 
-// The given particles, if the first activation finds no room.
+// Results with the given particles, if the pool has no room for the first activation.
 template <class T, int D>
 Results no_step(const SubstepsInputs& in, const Tensor& history, const Tensor& status, const Tensor& impulse,
                 const Tensor& time) {
@@ -143,7 +143,7 @@ Results run(const SubstepsInputs& in) {
   Tensor residual_ = result(x, has(in.residual), {P, D_});  // read by G2P only
   Tensor status[] = {empty_int(x, {1 + in.scenes, kStatusSize}), empty_int(x, {1 + in.scenes, kStatusSize})};
   Tensor impulse_, time_;
-  int last = 0;  // index of the buffer of the last step
+  int last = 0;  // index of the buffer with the results of the last step
   const auto start_in_results = [&] {
     torch::stable::copy_(x_[0], x);
     torch::stable::copy_(v_, in.v);

@@ -4,7 +4,7 @@
 #include "grid/geometry.h"
 #include "grid/shapes.h"
 
-// What a run asks of its particles between two steps: the limit of the time step, the speed, and whether all is well.
+// Quantities of the particles between two steps of a run: limit of the time step, speed, number of invalid particles.
 namespace mpm {
 
 enum Survey : int {
@@ -25,7 +25,7 @@ struct SurveyArguments {
   Field<const T> x, v, mass, volume, C, stress, stiffness, viscosity, energy, speed;
   double dx = 0, lower[D], upper[D];
   double bound = 0;                // of |∇v|²/|v|² on the nodes [1/m²]
-  double kept = 0;                 // 1 + s
+  double kept = 0;                 // 1 + s, the factor of 1/dt² in the linear limit
   bool volumetric = false;         // whether some law follows the volume alone
   ContactArguments<T, D> contact;  // obstacles that move; their `rounding` is how near a particle must be
   double* result = nullptr;        // [scenes, kSurveySize], zero on entry
@@ -57,7 +57,7 @@ MPM_HD T root_of_squares(T a, T b) {
 
 template <class T, int D>
 MPM_HD T norm(const Matrix<T, D>& m) {
-  double squares = 0;  // of large stresses too
+  double squares = 0;  // in double: squares of large stresses overflow in float
   MPM_UNROLL for (int i = 0; i < D; i++) MPM_UNROLL
     for (int j = 0; j < D; j++) squares += double(m[i][j]) * double(m[i][j]);
   return T(sqrt(squares));
@@ -121,7 +121,7 @@ MPM_HD Surveyed<T> survey_particle(const SurveyArguments<T, D>& a, int64_t p, in
   const T inverse_inertia = T(a.bound) * load_scalar(at, a.volume) / load_scalar(at, a.mass);
   const T oscillation = oscillation_rate(a, at, inverse_inertia) + speed / T(a.dx);
   const T deformation = deformation_rate(a, at, inverse_inertia, speed);
-  // A rate that is not known, NaN, limits nothing.
+  // A rate that is NaN is unknown and sets no limit.
   s.rate = oscillation > T(0) ? oscillation : T(0);
   if (deformation > s.rate) s.rate = deformation;
   if (!(s.speed >= T(0))) s.speed = T(0);

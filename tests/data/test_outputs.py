@@ -96,9 +96,9 @@ found = []
 for words, sizes in json.loads(sys.argv[1]):
     for size in sizes:
         resource.setrlimit(resource.RLIMIT_FSIZE, (size, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
-        with contextlib.redirect_stderr(io.StringIO()) as told:
+        with contextlib.redirect_stderr(io.StringIO()) as printed:
             status = main(words)
-        found.append([status, told.getvalue().splitlines()[-1:]])
+        found.append([status, printed.getvalue().splitlines()[-1:]])
 print(json.dumps(found))
 """
 LARGEST = {

@@ -104,8 +104,8 @@ def test_every_command_that_reads_scene_files_ends_with_one_line(tmp_path, capsy
     for wrong in ({**GOOD, "gravity": [1e300, 0.0]}, {**GOOD, "material": {"a\0b": SAND}}, {**GOOD, "obstacle": [{}]}):
         with_text(path, json.dumps(wrong))
         assert main([words[0], str(path), *words[1:]]) == 1
-        told = [line for line in capsys.readouterr().err.splitlines() if "scene file" in line]
-        assert len(told) == 1 and f"{shard_path(path, 0)}: scene_0000001 has a wrong scene file: " in told[0]
+        printed = [line for line in capsys.readouterr().err.splitlines() if "scene file" in line]
+        assert len(printed) == 1 and f"{shard_path(path, 0)}: scene_0000001 has a wrong scene file: " in printed[0]
     assert {file.name for file in path.iterdir()} == {"dataset.json", "shards"}
 
 

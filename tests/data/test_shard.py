@@ -338,9 +338,9 @@ def test_a_file_is_blamed_only_where_it_has_changed(written, monkeypatch):
                 raise OSError(words.format(reason))
 
             patch.setattr(h5py.Dataset, "__getitem__", fails)
-            with pytest.raises(kind, match=message) as told:
+            with pytest.raises(kind, match=message) as raised:
                 scene.window("position", 0, 5)
-            assert "remove it" not in str(told.value)
+            assert "remove it" not in str(raised.value)
 
 
 @pytest.mark.parametrize(

@@ -244,7 +244,7 @@ def test_steps_that_are_too_long_for_a_front_are_reported(device):
             found = [str(w.message) for w in caught if w.category is mpm.FrontWarning]
             assert bool(found) == warned
             if warned:
-                assert "the first of which is 1, lag behind by up to 1.5 dx" in found[0] and "of 9;" in found[0]
+                assert "first in scene 1, lag behind by up to 1.5 dx" in found[0] and "of 9;" in found[0]
     heat.forget(torch.tensor([False, True], device=device))
     with warnings.catch_warnings():
         warnings.simplefilter("error")

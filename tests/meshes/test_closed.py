@@ -114,8 +114,8 @@ def test_the_mass_is_that_of_the_filled_places(name):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         points = mpm.seed.mesh(make(), 0.05, per_cell=8, dtype=torch.float64)
-    told = [str(w.message) for w in caught if w.category is UserWarning]
-    assert [bool(re.search(message or "none", line)) for line in told] == [True] * (message is not None)
+    messages = [str(w.message) for w in caught if w.category is UserWarning]
+    assert [bool(re.search(message or "none", line)) for line in messages] == [True] * (message is not None)
     mass = float(mpm.State.at_rest(points, density=1000.0).mass.sum())
     assert mass == pytest.approx(right, rel=2e-4)
     assert len(points) * 0.025**3 * 1000 == pytest.approx(right, rel=1e-9)

@@ -8,6 +8,7 @@ from helpers import TOLERANCE, Particles, random_particles, relative_error
 from torch import Tensor
 
 import torch_mpm as mpm
+from torch_mpm.grid.topology import Status
 
 pytestmark = pytest.mark.cuda
 
@@ -73,7 +74,7 @@ def test_an_overflow_drops_whole_particles(dim, kernel, max_blocks):
     p = uneven_particles(dim, kernel, max_blocks=max_blocks).to("cuda", torch.float64)
     blocks = p.blocks()
     transferred = int(blocks.offsets[-1])
-    assert blocks.status[0, 0] > max_blocks and blocks.status[0, 6] == 0
+    assert blocks.status[0, Status.BLOCKS_WANTED] > max_blocks and blocks.status[0, Status.PROBLEM_ACTIVATION] == 0
     index = blocks.index.long()
     assert torch.equal(index.sort().values, torch.arange(len(p.x), device="cuda"))
     nodes = mpm.p2g(blocks, p.x, p.mass, p.v, p.C)

@@ -8,7 +8,8 @@ from cases.rollouts import DT, LAWS_HERE, one_by_one
 
 import torch_mpm as mpm
 from benchmarks.catalogue.scenes import blob, unit_box
-from torch_mpm.rollouts.plan import SCHEDULES, Facts, plan_call
+from torch_mpm.rollouts.facts import Facts
+from torch_mpm.rollouts.plan import SCHEDULES, plan_call
 
 CUDA = Facts(
     cuda=True,

@@ -7,6 +7,7 @@ from cases.rollouts import LAWS_HERE, TRANSFERS, WALLS, assert_equal
 import torch_mpm as mpm
 from benchmarks.catalogue.scenes import blob, touched, unit_box
 from torch_mpm._library import graph_loops
+from torch_mpm.grid.topology import Status
 from torch_mpm.rollouts.plan import SCHEDULES
 
 STEPS, DT = 24, 2e-4
@@ -59,12 +60,12 @@ def test_schedules_agree(law, transfer, walls, obstacles, device):
     for schedule in SCHEDULES:
         step, state = made(law, transfer, walls, obstacles, device)
         if not serves(schedule, device, law, transfer, walls):
-            with pytest.raises(ValueError, match=f"schedule must be one that supports the call, got {schedule}: .+"):
+            with pytest.raises(ValueError, match=f"^schedule must be one that supports the call, got {schedule}: .+"):
                 mpm.rollout(step, state, STEPS, DT, schedule=schedule)
             continue
         end = mpm.rollout(step, state, STEPS, DT, schedule=schedule)
         assert SCHEDULES[torch.ops.torch_mpm.latest_schedule(state.x)] == schedule
         step.check(end)
-        assert int(step.status[0, 5]) == STEPS
+        assert int(step.status[0, Status.ACTIVATIONS]) == STEPS
         expected = expected or end
         assert_equal(end, expected, schedule)

@@ -62,7 +62,7 @@ def unfinished(stopped, tmp_path):
     return shutil.copytree(stopped, tmp_path / "out")
 
 
-def told(capsys, *arguments):
+def printed(capsys, *arguments):
     """Error output of a failing command."""
     assert main([str(a) for a in arguments]) == 1
     return capsys.readouterr().err
@@ -106,13 +106,13 @@ def test_a_checkpoint_that_does_not_fit_leaves_the_one_before(tmp_path):
 def test_a_damaged_file_is_named_with_what_to_do(scene, unfinished, capsys, name, damage):
     path = unfinished / name
     path.write_bytes(DAMAGE[damage](path.read_bytes()))
-    errors = told(capsys, "run", scene, "-o", unfinished, "--resume", "--quiet")
+    errors = printed(capsys, "run", scene, "-o", unfinished, "--resume", "--quiet")
     assert errors.startswith(f"torch-mpm: {path}: ") and "remove" in errors
     if name == "trajectory.partial.h5":
-        assert str(path) in told(capsys, "export", unfinished, "--ply")
-        assert str(path) in told(capsys, "render", unfinished)
+        assert str(path) in printed(capsys, "export", unfinished, "--ply")
+        assert str(path) in printed(capsys, "render", unfinished)
     if name == "run.json":
-        assert str(path) in told(capsys, "render", unfinished)
+        assert str(path) in printed(capsys, "render", unfinished)
 
 
 def test_a_damaged_file_can_be_removed_to_start_again(scene, unfinished):
@@ -133,7 +133,7 @@ def test_a_bit_of_a_frame_that_changes_is_found(scene, unfinished, capsys):
     data[offset] ^= 1
     path.write_bytes(data)
     for arguments in (("run", scene, "-o", unfinished, "--resume", "--quiet"), ("export", unfinished, "--ply")):
-        assert "velocity of frame 0 is damaged" in told(capsys, *arguments)
+        assert "velocity of frame 0 is damaged" in printed(capsys, *arguments)
 
 
 # ---- forged files: the seal is right
@@ -213,7 +213,7 @@ def huge(file, name, shape):
 )  # fmt: skip
 def test_a_forged_checkpoint_is_refused(scene, unfinished, capsys, change, message):
     forge(unfinished / "checkpoint.h5", change)
-    errors = told(capsys, "run", scene, "-o", unfinished, "--resume", "--quiet")
+    errors = printed(capsys, "run", scene, "-o", unfinished, "--resume", "--quiet")
     assert (
         f"{unfinished / 'checkpoint.h5'}: " in errors and message in errors and "remove it and add --resume" in errors
     )
@@ -235,7 +235,7 @@ def test_a_forged_checkpoint_is_refused(scene, unfinished, capsys, change, messa
 )  # fmt: skip
 def test_a_forged_trajectory_is_refused(scene, unfinished, capsys, change, message):
     forge(unfinished / "trajectory.partial.h5", change)
-    assert message in told(capsys, "run", scene, "-o", unfinished, "--resume", "--quiet")
+    assert message in printed(capsys, "run", scene, "-o", unfinished, "--resume", "--quiet")
 
 
 @pytest.mark.parametrize(
@@ -254,7 +254,7 @@ def test_a_forged_trajectory_is_refused(scene, unfinished, capsys, change, messa
 def test_a_forged_record_is_refused(scene, unfinished, capsys, name, change, message):
     write_record(unfinished / "run.json", {**read_run(unfinished), **change})
     words = {"render": ["render", unfinished], "run": ["run", scene, "-o", unfinished, "--resume", "--quiet"]}
-    assert message in told(capsys, *words[name])
+    assert message in printed(capsys, *words[name])
 
 
 # ---- one process in a folder
@@ -264,7 +264,7 @@ def test_two_processes_in_one_folder(scene, unfinished, capsys):
     from torch_mpm.scene.folder import locked
 
     with locked(unfinished):
-        errors = told(capsys, "run", scene, "-o", unfinished, "--resume", "--quiet")
+        errors = printed(capsys, "run", scene, "-o", unfinished, "--resume", "--quiet")
     assert f"another process is working in {unfinished}" in errors
     assert main(["run", str(scene), "-o", str(unfinished), "--resume", "--quiet"]) == 0
 
@@ -281,14 +281,14 @@ def test_a_lock_alone_does_not_make_a_folder_somebody_elses(scene, tmp_path):
 
 
 def test_an_output_in_a_file_is_refused(scene, capsys):
-    assert "scene.toml" in told(capsys, "run", scene, "-o", scene / "x", "--quiet")
-    assert "is a file" in told(capsys, "run", scene, "-o", scene, "--quiet")
-    assert "/proc/torch_mpm" in told(capsys, "run", scene, "-o", "/proc/torch_mpm", "--quiet")
+    assert "scene.toml" in printed(capsys, "run", scene, "-o", scene / "x", "--quiet")
+    assert "is a file" in printed(capsys, "run", scene, "-o", scene, "--quiet")
+    assert "/proc/torch_mpm" in printed(capsys, "run", scene, "-o", "/proc/torch_mpm", "--quiet")
 
 
 def test_pictures_that_a_trajectory_cannot_give(scene, unfinished, capsys):
     pytest.importorskip("matplotlib")
-    errors = told(capsys, "render", unfinished, "--set", "render={color_by='stress'}")
+    errors = printed(capsys, "render", unfinished, "--set", "render={color_by='stress'}")
     assert "render.color_by: the trajectory has no 'stress'" in errors
-    errors = told(capsys, "render", unfinished, "--set", "render={resolution=[0, 5]}")
+    errors = printed(capsys, "render", unfinished, "--set", "render={resolution=[0, 5]}")
     assert "run.json: render.resolution: takes a width and a height of 16 to 16384 pixels, got (0, 5)" in errors

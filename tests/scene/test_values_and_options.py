@@ -32,8 +32,8 @@ from torch_mpm.cli import main
 def test_values_that_no_simulation_can_hold(tmp_path, capsys, command, override, message):
     """In `check` as in `run`."""
     assert main(scene_command(tmp_path, command, override)) == 1
-    told = capsys.readouterr().err
-    assert message in told and len(told.splitlines()) <= 3, told
+    printed = capsys.readouterr().err
+    assert message in printed and len(printed.splitlines()) <= 3, printed
     assert not (tmp_path / "out").exists()
 
 
@@ -116,5 +116,5 @@ def test_one_line_for_each_mistake_of_a_configuration(tmp_path, capsys, override
     (tmp_path / "set.toml").write_text(CONFIGURATION)
     words = ["generate", str(tmp_path / "set.toml"), "-o", str(tmp_path / "out"), "--quiet"]
     assert main([*words, "--set", override]) == 1
-    told = capsys.readouterr().err
-    assert message in told and len(told.splitlines()) == 1, told
+    printed = capsys.readouterr().err
+    assert message in printed and len(printed.splitlines()) == 1, printed

@@ -12,7 +12,7 @@ from ..grid.grid import Blocks, Grid
 from ..ops import contact, contact_impulses
 from ..ops.contact import MAX_OBSTACLES, is_of_kernel, is_solid
 from ..ops.impulses import impulse_of_nodes
-from ..precision import from_half, full_precision
+from ..ops.precision import from_half, full_precision
 from ..state.state import State
 from ..step.clocks import time_like
 from . import Obstacle, Walls, call_boundary

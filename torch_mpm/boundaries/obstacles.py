@@ -80,7 +80,7 @@ class Obstacle(RigidMotion):
 
     All of these may be assigned between control steps: one is a call of a step, of `rollout`, `rollout_to` or
     `Environments.advance`, or the steps from one call of a hook to the next. A state stores where its steps have left
-    each obstacle (`pose_in`). From there the obstacle goes on in the next control step:
+    each obstacle (`pose_in`). From there the obstacle continues in the next control step:
 
     - Without a velocity, an assigned `position` is where the centre is at the end of the control step. It moves there
       at the constant velocity of the change, which pushes, and then rests. So for `rotation` without an
@@ -143,7 +143,7 @@ class Obstacle(RigidMotion):
         self.placements = 0
         """How often it was placed."""
         self.course: Course | None = None
-        """Of the control step that goes on, see `boundaries.control`."""
+        """Motion in the current control step, see `boundaries.control`; None outside."""
 
     def __setattr__(self, name: str, value: Any) -> None:
         if isinstance(getattr(type(self), name, None), property):

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from ..errors import check_like
 from ..laws import Material
-from ..precision import from_half
+from ..ops.precision import from_half
 from ..state.state import State
 from ..step.step import Step
 

@@ -94,10 +94,10 @@ def content_of(module: nn.Module) -> tuple[Hashable, ...]:
 
     # The length of steps, over which paths are differenced, differs between a control step and outside.
     unread = isinstance(module, RigidMotion) and not module.follows_path
-    left_out = _EVERY | {"pace"} if unread else _EVERY
-    values = [(name, attribute(value)) for name, value in vars(module).items() if name not in left_out]
-    told = tuple((name, value) for name, value in values if value is not None)
-    return module.training, has_hooks(module), tuple(read), told
+    excluded = _EVERY | {"pace"} if unread else _EVERY
+    values = [(name, attribute(value)) for name, value in vars(module).items() if name not in excluded]
+    assigned = tuple((name, value) for name, value in values if value is not None)
+    return module.training, has_hooks(module), tuple(read), assigned
 
 
 def _value(value: Any) -> Hashable:

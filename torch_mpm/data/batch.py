@@ -23,7 +23,7 @@ LOOK = 8
 MOST_SUBSTEPS = 100_000
 """Maximum number of substeps of a frame; a scene that needs more fails."""
 
-Told = Callable[[int], None]
+OnFrame = Callable[[int], None]
 """Function that is called with the number of each frame."""
 
 
@@ -79,7 +79,7 @@ def simulate(
     frames: int,
     interval: float,
     count: int,
-    told: Told | None = None,
+    on_frame: OnFrame | None = None,
     executor: Executor | None = None,
     packed: Sequence[bool] | None = None,
     behind: Sequence[Mapping[str, Array]] | None = None,
@@ -92,7 +92,7 @@ def simulate(
         frames: T, including the first.
         interval: time between two frames [s].
         count: substeps per frame.
-        told: called after each frame has been queued.
+        on_frame: called after each frame has been queued.
         executor, packed, behind: as in `FrameTransfer`.
 
     Returns:
@@ -103,7 +103,7 @@ def simulate(
         shapes = shapes_of(names, built.grid.dim)
         transfer = FrameTransfer(frames, particles_of(built), shapes, built.state.x.device, executor, packed, behind)
         try:
-            reports = _run(built, transfer, names, frames, interval, count, told)
+            reports = _run(built, transfer, names, frames, interval, count, on_frame)
             stored = transfer.finish()
         except BaseException:
             transfer.abandon()
@@ -114,7 +114,7 @@ def simulate(
 
 def _run(
     built: Built, transfer: FrameTransfer, names: Sequence[str], frames: int, interval: float, count: int,
-    told: Told | None,
+    on_frame: OnFrame | None,
 ) -> Tensor:  # fmt: skip
     """Queue all frames; returns the results of reports, float64 [reports, 3, B] on the device."""
     step, state, reports = built.step, step_ready(built), []
@@ -130,8 +130,8 @@ def _run(
                 heap.trim()
         taken = _take_all([_field(built, state, name) for name in names], order)
         transfer.put(dict(zip(names, taken, strict=True)))
-        if told is not None:
-            told(frame)
+        if on_frame is not None:
+            on_frame(frame)
     return torch.stack(reports)
 
 

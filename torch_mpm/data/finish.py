@@ -59,8 +59,8 @@ def _check_files(dataset: DatasetFolder) -> None:
         path = shard_path(dataset.path, index)
         if index >= dataset.record.shards:
             raise _superfluous(path, dataset.record)
-        told = ShardRecord.read(record_path(path))
-        if not path.is_file() or path.stat().st_size != told.bytes:
+        recorded = ShardRecord.read(record_path(path))
+        if not path.is_file() or path.stat().st_size != recorded.bytes:
             raise DamagedFileError(path, "is gone, or not as long as its record says", REMEDY)
 
 
@@ -101,22 +101,22 @@ def _shard_problems(shard: Shard, record: DatasetRecord, index: int) -> Iterator
     expected = record.ids(index)
     if shard.ids != expected:
         yield f"{shard.path}: has the scenes {shard.ids!s:.100}, not {expected[0]} to {expected[-1]}"
-    for told in shard.record.scenes:
+    for recorded in shard.record.scenes:
         try:
-            problems = list(_scene_problems(shard.scene(told.id), told, record))
+            problems = list(_scene_problems(shard.scene(recorded.id), recorded, record))
         except DamagedFileError as error:
             yield f"{error} (--check does so for all damaged shards)"
         else:
-            yield from (f"{shard.path}: scene {told.id} {problem}" for problem in problems)
+            yield from (f"{shard.path}: scene {recorded.id} {problem}" for problem in problems)
 
 
-def _scene_problems(stored: StoredScene, told: SceneRecord, record: DatasetRecord) -> Iterator[str]:
+def _scene_problems(stored: StoredScene, recorded: SceneRecord, record: DatasetRecord) -> Iterator[str]:
     arrays = {name: stored[name] for name in stored.names}
-    if content_hash(arrays) != told.hash:
+    if content_hash(arrays) != recorded.hash:
         yield "has another hash than its record says"
-    if stored.attributes.get("failure", told.failure) != told.failure:
+    if stored.attributes.get("failure", recorded.failure) != recorded.failure:
         yield "has another failure in its record than in its file"
-    if not told.valid:
+    if not recorded.valid:
         return
     if lacking := [name for name in record.fields if name not in arrays]:
         yield f"lacks {', '.join(lacking)}"
@@ -126,7 +126,7 @@ def _scene_problems(stored: StoredScene, told: SceneRecord, record: DatasetRecor
     if broken:
         yield f"has numbers that are not finite in {', '.join(broken)}"
         return
-    if not _same_motion(motion_sums(arrays["position"], arrays.get("particle_type")), told.motion):
+    if not _same_motion(motion_sums(arrays["position"], arrays.get("particle_type")), recorded.motion):
         yield "has other statistics than its record says"
     free = arrays.get("particle_type", np.zeros(stored.particles)) != BOUNDARY
     x = arrays["position"][:, free]
@@ -138,11 +138,11 @@ def _scene_problems(stored: StoredScene, told: SceneRecord, record: DatasetRecor
         yield f"gains {gain:.1%} of its energy"
 
 
-def _same_motion(found: Motion, told: Motion | None) -> bool:
+def _same_motion(found: Motion, recorded: Motion | None) -> bool:
     """Whether sums agree: those of a device are added in another order, with differences far below `STATISTICS`."""
-    if told is None:
+    if recorded is None:
         return False
-    for a, b in ((found.velocity, told.velocity), (found.acceleration, told.acceleration)):
+    for a, b in ((found.velocity, recorded.velocity), (found.acceleration, recorded.acceleration)):
         # Bound of |sum|, by the Cauchy-Schwarz inequality.
         scale = np.sqrt(np.maximum(np.array(a.squares) * a.count, 1e-300))
         if a.count != b.count or len(a.sum) != len(b.sum) or len(a.squares) != len(b.squares):

@@ -163,8 +163,8 @@ class StoredScene:
         frames, particles, dim: T, N and D; 0 for a failed scene.
     """
 
-    def __init__(self, path: Path, group: Any, told: SceneRecord, intact: Callable[[], bool]) -> None:
-        self.path, self._group, self.name, self._digests = path, group, group.name[1:], told.digests
+    def __init__(self, path: Path, group: Any, recorded: SceneRecord, intact: Callable[[], bool]) -> None:
+        self.path, self._group, self.name, self._digests = path, group, group.name[1:], recorded.digests
         self._intact = intact
         try:
             problem, self.attributes = _scene_problem(group, path.stat().st_size)
@@ -174,15 +174,15 @@ class StoredScene:
         if not problem and "position" in group:
             shape = group["position"].shape
         self.frames, self.particles, self.dim = shape
-        if problem := problem or self._difference(told):
+        if problem := problem or self._difference(recorded):
             raise DamagedFileError(path, f"{group.name[1:]} {problem}", REMEDY)
 
-    def _difference(self, told: SceneRecord) -> str:
+    def _difference(self, recorded: SceneRecord) -> str:
         """Difference from the record of the scene; "" for none."""
-        if not bool(len(self._group)) == bool(self.attributes.get("valid", told.valid)) == told.valid:
+        if not bool(len(self._group)) == bool(self.attributes.get("valid", recorded.valid)) == recorded.valid:
             return "is valid in its record or in its file, but not in both"
-        if self.particles != told.particles:
-            return f"has {self.particles} particles, not {told.particles} as its record says"
+        if self.particles != recorded.particles:
+            return f"has {self.particles} particles, not {recorded.particles} as its record says"
         return ""
 
     @functools.cached_property
@@ -321,8 +321,8 @@ class Shard:
             raise unreadable(self.path, f"{name} cannot be read", error, REMEDY, self._intact) from None
         if not isinstance(group, h5py.Group):
             raise DamagedFileError(self.path, f"lacks {name}", REMEDY)
-        told = next(told for told in self.record.scenes if told.id == scene_id)
-        return StoredScene(self.path, group, told, self._intact)
+        recorded = next(recorded for recorded in self.record.scenes if recorded.id == scene_id)
+        return StoredScene(self.path, group, recorded, self._intact)
 
     def __iter__(self) -> Iterator[StoredScene]:
         return (self.scene(scene_id) for scene_id in self.ids)

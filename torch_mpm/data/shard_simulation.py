@@ -26,7 +26,7 @@ from .packing import Compressed
 from .sampling import NoRoom, content
 from .statistics import Motion
 
-Told = Callable[[int, int], None]
+OnFrame = Callable[[int, int], None]
 """Function that is called with the number of simulated scenes and the number of the queued frame."""
 
 
@@ -132,7 +132,7 @@ def simulate(
     configuration: Configuration,
     drawn: Drawn,
     device: torch.device,
-    told: Told | None = None,
+    on_frame: OnFrame | None = None,
     packers: Executor | None = None,
 ) -> None:
     """Simulate the drawn scenes; the results are in their outcomes.
@@ -141,7 +141,7 @@ def simulate(
         configuration: configuration of the data set.
         drawn: the scenes.
         device: device of the simulation.
-        told: called after each frame has been queued.
+        on_frame: called after each frame has been queued.
         packers: executor that packs the scenes during the simulation.
 
     Raises:
@@ -155,7 +155,7 @@ def simulate(
     for attempt in range(dataset.attempts):
         if built is None or not rest:
             return
-        _attempt(configuration, rest, built, count * 2**attempt, told, packers)
+        _attempt(configuration, rest, built, count * 2**attempt, on_frame, packers)
         rest = [o for o in rest if o.failure]
         if rest and attempt + 1 < dataset.attempts:
             for outcome in rest:
@@ -180,7 +180,7 @@ def _substeps(
 
 
 def _attempt(
-    configuration: Configuration, outcomes: list[Outcome], built: Built, count: int, told: Told | None,
+    configuration: Configuration, outcomes: list[Outcome], built: Built, count: int, on_frame: OnFrame | None,
     packers: Executor | None,
 ) -> None:  # fmt: skip
     """Simulate scenes and store the arrays of valid ones."""
@@ -188,8 +188,8 @@ def _attempt(
     names = ("position", *dataset.fields)
 
     def frame_told(frame: int) -> None:
-        if told is not None:
-            told(len(outcomes), frame)
+        if on_frame is not None:
+            on_frame(len(outcomes), frame)
 
     packed, behind = [packers is not None] * len(outcomes), [o.behind for o in outcomes]
     try:

@@ -60,7 +60,7 @@ class FrontStatus:
         scenes = [b for b, r in enumerate(numbers) if r > LARGEST]
         if scenes:
             r = max(numbers)
-            where = "" if len(numbers) == 1 else f" in {len(scenes)} scenes, the first of which is {scenes[0]},"
+            where = "" if len(numbers) == 1 else f" in {len(scenes)} scenes, first in scene {scenes[0]},"
             warnings.warn(
                 f"fronts between phases{where} lag behind by up to {LEAST_LAG + LAG * math.sqrt(r):.2g} dx: particles "
                 f"changed their phase at a diffusion number of {r:.3g}; reduce dt to a diffusion number of {LARGEST:g} "

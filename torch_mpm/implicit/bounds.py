@@ -133,7 +133,7 @@ def node_bounds(
         walls, obstacles: as a `Step` has them.
         like: gives dtype and device.
         time: [s].
-        owners: whether the bounds are to tell whose they are.
+        owners: whether `NodeBounds.owner` is set.
 
     Raises:
         NotImplementedError: for boundaries that are no obstacles.

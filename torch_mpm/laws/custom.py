@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ..errors import check_count, check_number, shape_of
-from ..precision import from_half
+from ..ops.precision import from_half
 from .isotropic import isotropic
 from .material import Material
 

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from ..errors import shape_of
 from ..ops.arguments import no_vmap
+from ..ops.precision import from_half, full_precision
 from ..ops.svd import svd3
-from ..precision import from_half, full_precision
 
 
 def isotropic(F: Tensor, function: Callable[[Tensor], Any]) -> Any:

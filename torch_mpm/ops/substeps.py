@@ -30,7 +30,7 @@ not support the call is an error with the reason; its sums may round differently
     torch.ops.torch_mpm.plan_substeps(schedule, *facts) -> (schedule, max_blocks, steps, order, reasons)
     torch.ops.torch_mpm.latest_schedule(x) -> int
 
-The first plans a call of any device by its facts (`torch_mpm.rollouts.plan.Facts`), without tensors: its schedule, the
+The first plans a call of any device by its facts (`torch_mpm.rollouts.facts.Facts`), without tensors: its schedule, the
 blocks of its pool or -1, its steps at most, the order of its particles, and a line "schedule: reason" for each of the
 others. The second returns the schedule of the latest call of this thread on the device of a tensor.
 

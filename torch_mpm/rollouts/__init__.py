@@ -1,4 +1,4 @@
-"""Many steps in a row: which way they go, and the ways."""
+"""Rollouts: the plan of many steps, and the executors that compute them."""
 
 from .fused_op import substeps_arguments
 from .plan import RolloutPlan, plan_rollout

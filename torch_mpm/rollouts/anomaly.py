@@ -15,8 +15,8 @@ from ..step.failures import NAMED
 
 def detecting() -> bool:
     """Whether `torch.autograd.set_detect_anomaly` or `detect_anomaly` is active."""
-    asked = not torch.compiler.is_compiling() and torch.is_anomaly_enabled()
-    return asked and torch.is_anomaly_check_nan_enabled() and torch.is_grad_enabled()
+    enabled = not torch.compiler.is_compiling() and torch.is_anomaly_enabled()
+    return enabled and torch.is_anomaly_check_nan_enabled() and torch.is_grad_enabled()
 
 
 def begin() -> int:
@@ -88,10 +88,10 @@ def _check(name: str, place: _Place) -> Any:
         for number, gradient in enumerate(grad_inputs):
             if isinstance(gradient, Tensor) and gradient.dim() > 0 and bool(gradient.isnan().any()):
                 given = any(isinstance(g, Tensor) and bool(g.isnan().any()) for g in grad_outputs)
-                came = "; its incoming gradient was NaN already" if given else ""
+                origin = "; its incoming gradient was NaN already" if given else ""
                 raise RuntimeError(
                     f"the gradient of {name} is NaN (of its input {number}) in substep {place.substep} of the rollout, "
-                    f"{place.scenes(gradient)}{came}"
+                    f"{place.scenes(gradient)}{origin}"
                 )
 
     return check

@@ -25,13 +25,13 @@ KEPT_BYTES = {"cpu": 2**24, "cuda": 2**29}
 the caches of a CPU; on CUDA enough that the kernels hide the time of Python."""
 
 
-def resolved(steps: Steps, state: State, fused: bool) -> Checkpoints | None:
-    """Checkpoints of steps in their budget of memory, if they have one: `EVERYTHING` if all steps fit."""
-    kept = steps.checkpoints
-    if kept is None or kept.memory is None or kept is EVERYTHING:
-        return kept
+def within_budget(steps: Steps, state: State, fused: bool) -> Checkpoints | None:
+    """Checkpoints of steps that fit into their budget of memory, if they have one; `EVERYTHING` if all steps fit."""
+    checkpoints = steps.checkpoints
+    if checkpoints is None or checkpoints.memory is None or checkpoints is EVERYTHING:
+        return checkpoints
     sizes = bytes_kept(steps.step, state, steps.dt, fused)
-    return fitting(kept.memory, steps.n, *sizes, kept.offload) or EVERYTHING
+    return fitting(checkpoints.memory, steps.n, *sizes, checkpoints.offload) or EVERYTHING
 
 
 def bytes_kept(

@@ -64,7 +64,9 @@ class Checkpoints:
         if self.memory is not None:
             check_number("memory", self.memory, "a positive number of bytes", lambda v: 0 < v < math.inf)
         if check_flag("offload", self.offload) and self.states is not None:
-            raise ValueError("offload must be False with states: with every or memory, states may wait on the host")
+            raise ValueError(
+                "offload must be False with states, got True: only every and memory move states to the host"
+            )
 
     def repetitions(self, n: int) -> int:
         """Number of steps that the backward pass of n steps recomputes."""
@@ -183,9 +185,9 @@ class _EachTime(contextlib.AbstractContextManager[None]):
 def binomial(advance: Advance, state: State, n: int, states: int, step: Any) -> State:
     """The state n steps later, with at most `states` states stored at a time; n is 1 or more.
 
-    The first part of a rollout is recomputed from its first state, with as many states, after the backward pass of the
-    rest, which uses one state less; Griewank and Walther 2000 give the position of the split (algorithm 799,
-    "revolve").
+    The steps are split in two parts. The backward pass processes the second part first, with one state less; then it
+    recomputes the first part from its first state, with all states. The position of the split is that of Griewank and
+    Walther 2000 (algorithm 799, "revolve").
     """
 
     def part_of(first: int, count: int, states: int) -> Advance:
@@ -217,12 +219,12 @@ def _split(n: int, states: int) -> int:
 @functools.lru_cache(maxsize=1 << 16)
 def _evaluations(n: int, states: int) -> int:
     """Number of steps that a rollout and its backward pass compute."""
-    taken = 1
+    computed = 1
     while n > 1:
         part = _split(n, states)
-        taken += part + _evaluations(part, states)
+        computed += part + _evaluations(part, states)
         n, states = n - part, states - 1
-    return taken
+    return computed
 
 
 # ---- on the host

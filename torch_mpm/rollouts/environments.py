@@ -5,7 +5,7 @@
         paddle.position = policy(envs.observe("x"))                  # [B, D], where it is after the next call
         envs.advance(20, dt=1e-4)                                    # in which it moves there, and pushes
         force = envs.forces()[paddle].linear                         # [B, D] [N], the mean over these 20 steps
-        envs.freeze()                                                # scenes that went wrong stand still from here on
+        envs.freeze()                                                # failed scenes are not advanced until their reset
         envs.reset(envs.frozen | done(force))                        # bool [B] on the device: as they were at first
 
 The particles of scene b have the rows [b R, (b + 1) R) of the state. Unused rows are absent particles: their `scene` is
@@ -83,7 +83,8 @@ class Environments:
         device = state.x.device
         self._state = state.replace(time=torch.zeros(step.grid.scenes, dtype=torch.float64, device=device))
         self.frozen = torch.zeros(step.grid.scenes, dtype=torch.bool, device=device)
-        self._froze = False  # Whether a scene was ever frozen; its laws are evaluated all the same.
+        # Whether a scene was ever frozen: laws change its rows in each step, which are then restored.
+        self._froze = False
         self._before: tuple[Tensor, Tensor] | None = None
 
     def __len__(self) -> int:
@@ -144,7 +145,7 @@ class Environments:
         assert packed.scene is not None
         return packed.replace(scene=torch.where(packed.scene == ABSENT, ABSENT, own))
 
-    # -- running
+    # ---- steps and resets
 
     def advance(self, n: int, dt: float | Tensor) -> None:
         """Compute n steps of dt [s], a number or a tensor [B]; see `rollout`. Frozen scenes are not advanced.
@@ -226,10 +227,10 @@ class Environments:
                 rows.index_copy_(0, index, self._rows(new))
         extra = {name: changes.pop(name, value) for name, value in self.state.extra.items()}
         self.state = self.state.replace(**changes, extra=extra)
-        self._begin_anew(mask)
+        self._restart(mask)
 
-    def _begin_anew(self, mask: Tensor) -> None:
-        """Clocks, impulses and status of scenes."""
+    def _restart(self, mask: Tensor) -> None:
+        """Set clocks, impulses and status of the scenes of a mask to their initial values."""
         self.frozen = self.frozen & ~mask
         poses = {key: left.without(mask) for key, left in self.state.poses.items()}
         self.state = self.state.replace(time=torch.where(mask, 0.0, self.time)).with_poses(poses)
@@ -254,10 +255,10 @@ class Environments:
         return which.reshape(-1).to(self.time.device, torch.int64, non_blocking=True)
 
     def _mask(self, which: Tensor) -> Tensor:
-        """bool [B]."""
+        """Mask bool [B] of scenes."""
         return which if which.dtype == torch.bool else torch.zeros_like(self.frozen).index_fill_(0, which, True)
 
-    # -- looking
+    # ---- values of particles and boundaries
 
     def _rows(self, value: Any) -> Tensor:
         """A field [n R, ...] as [n, R, ...]."""
@@ -315,7 +316,7 @@ class Environments:
         one = self.state.replace(impulse=None).select(rows).with_poses({})
         return one.replace(scene=None, time=float(self.time[k]), impulse=impulse)
 
-    # -- files
+    # ---- files
 
     def save(self, path: str | Path, k: int | None = None) -> None:
         """Write all scenes, or scene k only, to an HDF5 file with checksums; needs h5py."""

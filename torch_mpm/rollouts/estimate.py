@@ -82,11 +82,11 @@ def estimate_rollout(
     if not callable(step):
         raise TypeError(f"step must be a Step or a function (state, dt) -> state, got {shape_of(step)}")
     check_count("n", n)
-    parts, kept = Parts(n, prefix, truncate), as_checkpoints(checkpoint)
+    parts, checkpoints = Parts(n, prefix, truncate), as_checkpoints(checkpoint)
     first = parts.first_with_gradient()
     start = differentiable(step.prepare(state) if isinstance(step, Step) else state)
     with aside(step, start.x), torch.enable_grad():
-        plan = plan_of_steps(Steps(step, n - first, dt, kept), start)
+        plan = plan_of_steps(Steps(step, n - first, dt, checkpoints), start)
         return _estimate(step, start, n - first, first, dt, plan)
 
 
@@ -99,47 +99,53 @@ def _estimate(
     plan: RolloutPlan,
 ) -> RolloutEstimate:
     """Estimate of n steps with gradients, as planned, after `prefix` steps without."""
-    in_op, keeps_all = plan.executor == "fused", plan.stores_all
-    kept = None if keeps_all else plan.checkpoints
+    in_op, stores_all = plan.executor == "fused", plan.stores_all
+    checkpoints = None if stores_all else plan.checkpoints
     of_state, of_step = bytes_kept(step, start, dt, in_op)
-    trial = max(min(n, TRIAL), 1)
-    calls = trial if kept is not None and kept.states is not None else 1  # Between stored states.
+    forward, both = _seconds_per_step(step, start, n, dt, plan)
+    if n == 0:
+        return RolloutEstimate(0, 0, prefix * forward, 0, prefix, len(start))
+    if checkpoints is None and (stores_all or not in_op):
+        run_time = prefix * forward + n * both
+        return RolloutEstimate(of_state + n * of_step, 0, run_time, 1, prefix + n, len(start))
+    if checkpoints is None:
+        checkpoints = Checkpoints(every=plan.steps_per_call)
+    states, recomputed = checkpoints.kept(n), checkpoints.repetitions(n)
+    extra = recomputed  # Recomputed steps whose time is not part of `both`.
+    if in_op:  # The backward pass of the op recomputes its own steps in any case.
+        extra, recomputed = (0, n) if checkpoints.every is not None else (recomputed, recomputed + n)
+    run_time = prefix * forward + n * both + extra * forward
+    of_states, on_host = states * of_state, checkpoints.offload and start.x.is_cuda
+    of_steps = min(checkpoints.every or 1, n) * of_step
+    on_device = of_steps + (0 if on_host else of_states)
+    steps = prefix + n + recomputed
+    return RolloutEstimate(on_device, of_states if on_host else 0, run_time, states, steps, len(start))
 
-    def taken() -> State:
+
+def _seconds_per_step(
+    step: Callable[[State, float | Tensor], State], start: State, n: int, dt: float | Tensor, plan: RolloutPlan
+) -> tuple[float, float]:
+    """Run time per step, without gradients and with the backward pass, of a few of n planned steps [s]."""
+    trial = max(min(n, TRIAL), 1)
+    by_states = not plan.stores_all and plan.checkpoints is not None and plan.checkpoints.states is not None
+    calls = trial if by_states else 1  # Between stored states.
+
+    def few_steps() -> State:
         state = start
         for _ in range(calls):
-            state = rollout(step, state, trial // calls, dt, EVERYTHING if keeps_all else None)
+            state = rollout(step, state, trial // calls, dt, EVERYTHING if plan.stores_all else None)
         return state
 
     @torch.no_grad()
     def forward() -> None:
-        taken()
+        few_steps()
 
     tensors = [*step.parameters(), *step.buffers()] if isinstance(step, torch.nn.Module) else []
     leaves = [start.x, start.v, *(t for t in tensors if t.requires_grad)]
 
     def both() -> None:
-        end = taken()
+        end = few_steps()
         torch.autograd.grad(end.x.sum() + end.v.sum(), leaves, allow_unused=True)
 
-    once, twice = (seconds(work, start.x.device) / trial for work in (forward, both))
-    if n == 0:
-        return RolloutEstimate(0, 0, prefix * once, 0, prefix, len(start))
-    if kept is None and (keeps_all or not in_op):
-        return RolloutEstimate(of_state + n * of_step, 0, prefix * once + n * twice, 1, prefix + n, len(start))
-    if kept is None:
-        kept = Checkpoints(every=plan.steps_per_call)
-    states, again, held = kept.kept(n), kept.repetitions(n), min(kept.every or 1, n)
-    extra = again
-    if in_op:  # The op recomputes its own steps in any case: the time of both ways includes them.
-        extra, again = (0, n) if kept.every is not None else (again, again + n)
-    spent = prefix * once + n * twice + extra * once
-    on_host = kept.offload and start.x.is_cuda
-    return RolloutEstimate(
-        held * of_step + (0 if on_host else states * of_state),
-        states * of_state if on_host else 0,
-        spent,
-        states,
-        prefix + n + again,
-        len(start),
-    )
+    device = start.x.device
+    return seconds(forward, device) / trial, seconds(both, device) / trial

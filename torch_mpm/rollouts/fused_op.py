@@ -22,17 +22,19 @@ from ..step.clocks import StepTimes, clocks, requires_grad, time_after
 from ..step.pause import paused
 from ..step.step import Step
 from .checkpoints import binomial, offloaded
-from .plan import SCHEDULES, RolloutPlan, differentiates, follows_paths, why_not_fused
+from .facts import differentiates, follows_paths
+from .plan import SCHEDULES, RolloutPlan
+from .reasons import why_not_fused
 from .sorting import STEPS_IN_ORDER, restore_order, sort_particles
 from .steps import Steps
 
 
 def in_calls(steps: Steps, state: State, plan: RolloutPlan) -> State:
-    """The state after the steps, by calls of the fused op as planned. The op recomputes steps for the backward pass
-    where it may not store all that their gradient needs."""
+    """The state after the steps, by calls of the fused op as planned. Unless the plan stores all steps, the backward
+    pass of the op recomputes them."""
     step, n, dt, *_ = steps
     assert plan.facts is not None and isinstance(step, Step)
-    with_gradient, kept = plan.facts.gradients, plan.checkpoints
+    with_gradient, checkpoints = plan.facts.gradients, plan.checkpoints
     if plan.sorts:
         return _in_order(steps, state, plan)
     schedule = plan.schedule if plan.forced else None
@@ -40,16 +42,16 @@ def in_calls(steps: Steps, state: State, plan: RolloutPlan) -> State:
     def advance(state: State, count: int, first: int = 0) -> State:
         while count > 0:
             call = plan.call(count, step.grid.max_blocks)
-            now = min(count, plan.steps_per_call) if with_gradient else call.steps
-            state = substeps(step, state, now, dt, plan.stores_all, call.max_blocks, schedule)
-            count -= now
+            steps_now = min(count, plan.steps_per_call) if with_gradient else call.steps
+            state = substeps(step, state, steps_now, dt, plan.stores_all, call.max_blocks, schedule)
+            count -= steps_now
         return state
 
     if not with_gradient or plan.stores_all:
         return advance(state, n)
-    if kept is not None and kept.states is not None and n > 0:
-        return binomial(advance, step.prepare(state), n, kept.states, step)
-    with offloaded(state) if kept is not None and kept.offload else contextlib.nullcontext():
+    if checkpoints is not None and checkpoints.states is not None and n > 0:
+        return binomial(advance, step.prepare(state), n, checkpoints.states, step)
+    with offloaded(state) if checkpoints is not None and checkpoints.offload else contextlib.nullcontext():
         return advance(state, n)
 
 
@@ -62,7 +64,7 @@ def _in_order(steps: Steps, state: State, plan: RolloutPlan) -> State:
     plan = plan.of_sorted()
     for first in range(0, n, most):
         start = sort_particles(step, end)
-        end = in_calls(steps.some(min(most, n - first), first), start, plan)
+        end = in_calls(steps.part(min(most, n - first), first), start, plan)
     return restore_order(step, end, start, given)
 
 
@@ -170,19 +172,19 @@ def _substeps(
     )
     errors.follow(errors.status, status)
     grid.watch(status)
-    if status.device.type == "cpu":  # where the op has let the pool grow, or stopped
+    if status.device.type == "cpu":  # The op has enlarged the pool, or stopped.
         grid.follow(status[0].tolist()[Status.BLOCKS_WANTED if grid.grows else Status.BLOCKS_NOW])
     extra = _history(state, history_names, history)
     now = time_after(state.time, dt, n) if time is None else _in_shape(time.detach(), state.time, dt)
     if requires_grad(dt) or requires_grad(state.time):
         known: Any = state.time + n * (dt.double() if isinstance(dt, Tensor) else dt)
-        now = now + (known - known.detach())  # which has the gradient
+        now = now + (known - known.detach())  # Adds the gradient, and not a value.
     residual = None if residual is None else residual.detach()
     return state.replace(x=x, v=v, C=C, F=F, J=J, extra=extra, time=now, impulse=impulse, x_residual=residual)
 
 
 def _in_shape(times: Tensor, time: float | Tensor, dt: float | Tensor) -> Tensor:
-    """Times of each scene as the sum of a time and dt has them: one where all have the same."""
+    """Times of scenes in the shape of `time + dt`: one value if neither has a value per scene."""
     shape = max((tuple(t.shape) for t in (time, dt) if isinstance(t, Tensor)), key=lambda s: (len(s), s))
     return times if times.shape == shape or not len(times) else times[:1].reshape(shape)
 
@@ -190,7 +192,7 @@ def _in_shape(times: Tensor, time: float | Tensor, dt: float | Tensor) -> Tensor
 def _gravity(step: Step, x: Tensor) -> Tensor | None:
     gravity = step.gravity_like(x)
     if not isinstance(step.gravity, Tensor):
-        return gravity  # [B, D] of numbers
+        return gravity  # Numbers, as [B, D].
     return None if gravity is None else per_scene(gravity, x, step.grid.scenes, step.grid.dim)
 
 

@@ -44,7 +44,7 @@ class GradientNorms:
         return [*range(first, n, self.every), n]
 
     def start(self, steps: Sequence[int], scenes: int, dx: float, dt: float | Tensor) -> None:
-        """Start anew.
+        """Begin another rollout: norms of the previous one are dropped.
 
         Args:
             steps: numbers of steps before the states with a norm.

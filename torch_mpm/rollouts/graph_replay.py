@@ -1,4 +1,4 @@
-"""Rollouts without gradients as replays of a CUDA graph of one step, or of a segment."""
+"""Replays of a CUDA graph of one step, or of one segment of steps, without gradients."""
 
 from __future__ import annotations
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import weakref
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -13,9 +13,8 @@ from torch.autograd.function import once_differentiable
 
 from ..boundaries.control import control_step, steady
 from ..cuda_graphs.capture import CapturedGraphs, Same
-from ..cuda_graphs.graph import WorkInFlight, copied, copy_all, time_tensor
+from ..cuda_graphs.graph import Graphs, WorkInFlight, no_hooks, time_tensor
 from ..cuda_graphs.keys import StepKey, autocast_of, surroundings
-from ..cuda_graphs.memory import GraphMemory, on_own_stream
 from ..errors import check_count, shape_of
 from ..grid.grid import own_pools
 from ..laws.mixture import Mixture
@@ -129,8 +128,8 @@ class GraphedStep:
 
     def __call__(self, state: State) -> State:
         check_state(state)
-        with control_step(self._step, state, self._n, self._dt) as left:
-            return left(self.after(state, StepKey(self._step)))
+        with control_step(self._step, state, self._n, self._dt) as end_motion:
+            return end_motion(self.after(state, StepKey(self._step)))
 
     def capture(self, state: State) -> None:
         """Capture the steps for states like this one, in the current grad mode and autocast."""
@@ -240,7 +239,7 @@ class _Steps:
     @property
     def step(self) -> nn.Module:
         step = self._step()
-        assert step is not None, "its captured graphs go with a step"
+        assert step is not None, "captured graphs are deleted with their step"
         return step
 
     def __call__(self, *tensors: Tensor) -> tuple[Tensor, ...]:
@@ -280,7 +279,7 @@ class _Call:
             if self._graphs.latest is not self._mark:
                 with uncounted(self._step), self._same_random_numbers():
                     graphs.forward(given)
-            self._graphs.latest = None  # the backward pass overwrites its inputs
+            self._graphs.latest = None  # The backward pass overwrites its inputs.
             # The next replay overwrites its gradients.
             return [None if grad is None else grad.clone() for grad in graphs.backward(grads)]
 
@@ -356,107 +355,3 @@ class _CapturedSteps:
                 graphs.unseen = 0
             grid.watch(status)
         graphs.unseen += 1
-
-
-def no_hooks() -> contextlib.AbstractContextManager[Any]:
-    """Context without the hooks of a surrounding checkpoint, which would count tensors saved by autograd or move them
-    to the host."""
-    if torch._C._autograd._top_saved_tensors_default_hooks(True) is None:
-        return contextlib.nullcontext()  # transforms refuse hooks
-    return torch.autograd.graph.saved_tensors_hooks(lambda t: t, lambda t: t)
-
-
-class Graphs:
-    """A function of tensors as a CUDA graph, and its gradients as another, which read and write the same memory in each
-    replay.
-
-    Args:
-        steps: the function; it must not wait for the device.
-        given: its arguments.
-        wanted: whether the gradient by an argument is computed, for each of them.
-
-    Attributes:
-        follows: whether a result has a gradient, for each of them; set by `capture`.
-    """
-
-    def __init__(
-        self, steps: Callable[..., tuple[Tensor, ...]], given: Sequence[Tensor], wanted: Sequence[bool]
-    ) -> None:
-        self._steps = steps
-        self._device = given[0].device
-        self.read = [copied(t.detach()).requires_grad_(w) for t, w in zip(given, wanted, strict=True)]
-        self.follows: list[bool] = []
-
-    def try_out(self) -> None:
-        """Call the function and its gradients once on the stream of graphs, so that work of a first call is done before
-        the capture.
-
-        Raises:
-            ValueError: gradients would pass to a tensor that is no argument, and replays would lose them.
-        """
-        with on_own_stream(self._device):
-            ends = self._steps(*self.read)
-            if other := next(_others(ends, self.read), None):
-                raise ValueError(
-                    "a tensor that requires a gradient must be a parameter or buffer of the step or a field of the "
-                    f"state in steps from CUDA graphs, got {other}: make the function that reads it a "
-                    "torch.nn.Module that has it"
-                )
-            self._gradients(ends, [torch.zeros_like(t) for t in ends if t.requires_grad])
-
-    def _gradients(self, ends: Sequence[Tensor], grads: Sequence[Tensor]) -> list[Tensor | None]:
-        outputs = [t for t in ends if t.requires_grad]
-        if not outputs:
-            return [None] * len(self.read)
-        wanted = [t for t in self.read if t.requires_grad]
-        with torch.autocast(self._device.type, enabled=False):  # as in every backward pass
-            found = iter(torch.autograd.grad(outputs, wanted, grads, allow_unused=True))
-        return [next(found) if t.requires_grad else None for t in self.read]
-
-    def capture(self, beside: Graphs | None) -> None:
-        """Capture the graphs, in the memory of `beside` if given."""
-        self._forward, self._backward = torch.cuda.CUDAGraph(), torch.cuda.CUDAGraph()
-        self._memory: GraphMemory = GraphMemory(self._device, waits=True) if beside is None else beside._memory
-        with self._memory.capturing(self._forward):
-            ends = self._steps(*self.read)
-        self.follows = [t.requires_grad for t in ends]
-        self._grads = [torch.zeros_like(t) for t in ends if t.requires_grad]
-        if self._grads:
-            with self._memory.capturing(self._backward):
-                self._found = self._gradients(ends, self._grads)
-        self._ends = [t.detach() for t in ends]
-
-    def forward(self, given: Sequence[Tensor]) -> Sequence[Tensor]:
-        """The results, in memory that the next replay overwrites."""
-        with torch.no_grad():
-            copy_all(self.read, given)
-        self._forward.replay()
-        return self._ends
-
-    def backward(self, grads: Sequence[Tensor | None]) -> Sequence[Tensor | None]:
-        """Gradients with respect to the arguments of the latest replay, from those of the results."""
-        self._take(grads)
-        self._backward.replay()
-        return self._found
-
-    def _take(self, grads: Sequence[Tensor | None]) -> None:
-        own = [grad for grad, follows in zip(grads, self.follows, strict=True) if follows]
-        there = [(to, grad) for to, grad in zip(self._grads, own, strict=True) if grad is not None]
-        for to, grad in zip(self._grads, own, strict=True):
-            if grad is None:
-                to.zero_()
-        copy_all([to for to, _ in there], [grad for _, grad in there])
-
-
-def _others(ends: Sequence[Tensor], read: Sequence[Tensor]) -> Iterator[str]:
-    """Descriptions of leaves to which gradients of the results would pass, other than the tensors that are read."""
-    waiting: list[Any] = [t.grad_fn for t in ends if t.grad_fn is not None]
-    known = set[Any]()
-    while waiting:
-        node = waiting.pop()
-        if node in known:
-            continue
-        known.add(node)
-        if node.name().endswith("AccumulateGrad") and not any(node.variable is t for t in read):
-            yield f"one of shape {list(node.variable.shape)}"
-        waiting += [parent for parent, _ in node.next_functions if parent is not None]

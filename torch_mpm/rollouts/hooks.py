@@ -1,4 +1,4 @@
-"""Parts of rollouts: hooks between steps, a prefix without gradients, truncated gradients, and their norms."""
+"""Actions between the steps of a rollout: hooks, the end of a prefix without gradients, cuts and norms of gradients."""
 
 from __future__ import annotations
 
@@ -68,38 +68,39 @@ class Parts:
                 hook.
         """
         prefix, cuts = self.first_with_gradient(), self.cuts()
-        acting = set() if self.hook is None else set(range(0, self.n, self.every))
-        seen = set() if self.norms is None else set(self.norms.points(prefix, self.n))
+        hooked = set() if self.hook is None else set(range(0, self.n, self.every))
+        measured = set() if self.norms is None else set(self.norms.points(prefix, self.n))
         if self.norms is not None:
-            self.norms.start(sorted(seen), *scales)
-        stops = sorted({0, prefix, self.n} | cuts | acting | seen)
-        began, control_steps = state, _ControlSteps(control, sorted({0, self.n} | acting))
+            self.norms.start(sorted(measured), *scales)
+        stops = sorted({0, prefix, self.n} | cuts | hooked | measured)
+        began, control_steps = state, _ControlSteps(control, sorted({0, self.n} | hooked))
         with control_steps:
-            for k, end in zip(stops, [*stops[1:], self.n], strict=True):
+            for k, following in zip(stops, [*stops[1:], self.n], strict=True):
                 mode = torch.no_grad if k < prefix else contextlib.nullcontext
-                state = control_steps.left(state, k)
+                state = control_steps.end(state, k)
                 with mode():
-                    if k in acting:
-                        acted = self._acted(state, k)
-                        if acted is not state and k in cuts:
+                    if k in hooked:
+                        returned = self._after_hook(state, k)
+                        if returned is not state and k in cuts:
                             raise ValueError(
                                 f"hook must not return a state before step {k}, where truncate={self.truncate} cuts "
                                 f"the gradient, also that of its result: choose truncate and every={self.every} such "
                                 "that n - truncate, n - 2 truncate, ... are not multiples of every"
                             )
-                        if acted is not state:
-                            began = state = acted
+                        if returned is not state:
+                            began = state = returned
                     if k in cuts:
                         began = state = _cut(state, began)
-                    if k in seen:
+                    if k in measured:
                         assert self.norms is not None
                         state = self.norms.watched(state, k)
                 control_steps.begin(state, k)
                 with mode():
-                    state = advance(state, end - k, k) if end > k else state
+                    state = advance(state, following - k, k) if following > k else state
         return state
 
-    def _acted(self, state: State, k: int) -> State:
+    def _after_hook(self, state: State, k: int) -> State:
+        """The state that the hook returns before step k, or the given one."""
         assert self.hook is not None
         result = self.hook(state, k)
         if result is None:
@@ -115,12 +116,12 @@ class _ControlSteps(contextlib.ExitStack):
     def __init__(self, control: Control, bounds: list[int]) -> None:
         super().__init__()
         self._control, self._bounds = control, bounds
-        self._left: Callable[[State], State] | None = None
+        self._end: Callable[[State], State] | None = None
 
-    def left(self, state: State, k: int) -> State:
-        """State before step k, where a control step may end."""
-        if k in self._bounds and self._left is not None:
-            state, self._left = self._left(state), None
+    def end(self, state: State, k: int) -> State:
+        """State before step k, after the end of a control step if it ends there."""
+        if k in self._bounds and self._end is not None:
+            state, self._end = self._end(state), None
             self.close()
         return state
 
@@ -128,7 +129,7 @@ class _ControlSteps(contextlib.ExitStack):
         """Begin the control step before step k, if there is one."""
         if k in self._bounds and k < self._bounds[-1]:
             count = next(bound for bound in self._bounds if bound > k) - k
-            self._left = self.enter_context(self._control(state, count))
+            self._end = self.enter_context(self._control(state, count))
 
 
 def _cut(state: State, began: State) -> State:

@@ -55,7 +55,7 @@ class _Arguments(torch.autograd.Function):
 
 
 class _Place:
-    """Placeholder of a tensor that autograd stores, and its value in backward passes that have called again."""
+    """Placeholder of a tensor that autograd stores, with its values by the number of the backward pass."""
 
     def __init__(self, t: Tensor) -> None:
         self.kind = _kind(t)
@@ -97,7 +97,9 @@ class _Call:
                 place = self._places[found]()
                 if place is not None:
                     if place.kind != _kind(t):
-                        raise RuntimeError(f"{CHANGED}: {_told(place.kind)} the first time, then {_told(_kind(t))}")
+                        raise RuntimeError(
+                            f"{CHANGED}: {_in_words(place.kind)} the first time, then {_in_words(_kind(t))}"
+                        )
                     place.values[backward] = t
                 found += 1
                 if found == len(self._places):
@@ -119,7 +121,7 @@ def _kind(t: Tensor) -> tuple[Any, ...]:
     return t.shape, t.dtype, t.device
 
 
-def _told(kind: tuple[Any, ...]) -> str:
+def _in_words(kind: tuple[Any, ...]) -> str:
     return f"{list(kind[0])} {kind[1]} on {kind[2]}"
 
 

@@ -1,4 +1,4 @@
-"""Many steps in a row: in one op where a step is all of compiled parts, otherwise from Python."""
+"""Rollouts: n steps from a state, by the executor of their plan."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from ..ops.arguments import split_dt
 from ..state.state import State, check_state
 from ..step.step import Step
 from .anomaly import begin, detecting, watch
-from .budget import resolved
+from .budget import within_budget
 from .checkpoints import Checkpoints, as_checkpoints, binomial, in_segments
 from .fused_op import in_calls
 from .gradient_norms import GradientNorms
 from .graph_replay import replayed
 from .graph_segments import graphed_steps
 from .hooks import Hook, Parts
-from .plan import RolloutPlan, check_plan, plan_of_steps, why_not_fused
+from .plan import RolloutPlan, check_plan, plan_of_steps
+from .reasons import why_not_fused
 from .steps import Steps
 
 
@@ -103,10 +104,10 @@ def rollout(
         steps = _as_planned(steps, plan)
     check_state(state)
     if truncate is None and hook is None and norms is None and prefix == 0 and every == 1 and every is not True:
-        with steps.call(state) as ended, steps.control(state) as left:
-            return ended(left(_computed(steps, state, plan)))
-    with steps.call(state) as ended:
-        return ended(_in_parts(steps, state, Parts(n, prefix, truncate, hook, every, norms), plan))
+        with steps.call(state) as end_call, steps.control(state) as end_motion:
+            return end_call(end_motion(_computed(steps, state, plan)))
+    with steps.call(state) as end_call:
+        return end_call(_in_parts(steps, state, Parts(n, prefix, truncate, hook, every, norms), plan))
 
 
 def _in_parts(steps: Steps, state: State, parts: Parts, plan: RolloutPlan | None) -> State:
@@ -114,17 +115,17 @@ def _in_parts(steps: Steps, state: State, parts: Parts, plan: RolloutPlan | None
     step, scales = steps.step, (1, 1.0, steps.dt)
     if isinstance(step, Step):
         state, grid = step.prepare(state), step.grid
-        split_dt(steps.dt, grid.scenes, state.x)  # which checks it
+        split_dt(steps.dt, grid.scenes, state.x)  # Checks dt.
         scales = grid.scenes, grid.dx, steps.dt
     if torch.is_grad_enabled():  # The budget of memory is the same for all parts.
-        with_gradient = steps.some(steps.n - parts.first_with_gradient())
+        with_gradient = steps.part(steps.n - parts.first_with_gradient())
         fused = steps.checkpoints is not None and why_not_fused(step, state, steps.dt) is None
-        steps = steps._replace(checkpoints=resolved(with_gradient, state, fused))
+        steps = steps._replace(checkpoints=within_budget(with_gradient, state, fused))
 
     def advance(state: State, count: int, k: int) -> State:
-        return _computed(steps.some(count, k), state, plan)
+        return _computed(steps.part(count, k), state, plan)
 
-    return parts.run(advance, state, scales, lambda state, count: steps.some(count).control(state))
+    return parts.run(advance, state, scales, lambda state, count: steps.part(count).control(state))
 
 
 def _as_planned(steps: Steps, plan: RolloutPlan) -> Steps:
@@ -135,7 +136,11 @@ def _as_planned(steps: Steps, plan: RolloutPlan) -> Steps:
 
 
 def _computed(steps: Steps, state: State, given: RolloutPlan | None = None) -> State:
-    """The state after the steps, by their plan. The executor of a given plan must be that of the plan of the steps."""
+    """The state after the steps, by their plan.
+
+    Raises:
+        ValueError: for a given plan with another executor than the plan of these steps.
+    """
     step = steps.step
     if isinstance(step, Step):
         state = step.with_residual(state, steps.dt)
@@ -151,35 +156,38 @@ def _computed(steps: Steps, state: State, given: RolloutPlan | None = None) -> S
 
 
 def _from_python(steps: Steps, state: State, plan: RolloutPlan) -> State:
-    """`_computed` by single steps, or by graphs of some."""
+    """The state after steps launched from Python: single steps, or graphs of several."""
     step, n = steps.step, steps.n
     grid = step.grid if isinstance(step, Step) else None
-    kept = None if plan.stores_all else plan.checkpoints
+    checkpoints = None if plan.stores_all else plan.checkpoints
 
-    def single(state: State, count: int, begins: int) -> State:
+    def advance(state: State, count: int, first: int) -> State:
         if plan.executor == "graph":
-            return graphed_steps(steps.some(count, begins), state, plan.steps_per_call)
-        for k in range(begins, begins + count):
+            return graphed_steps(steps.part(count, first), state, plan.steps_per_call)
+        for k in range(first, first + count):
             mark = begin() if detecting() else None
             before, state = state, step(state, steps.dt)
             if mark is not None:
                 watch(before, state, mark, steps.first + k, grid)
         return state
 
-    if kept is not None and n > 0 and _begins_to_keep(step):
-        state, steps, n = single(state, 1, 0), steps.some(n - 1, 1), n - 1
-    if kept is None or n == 0:
-        return single(state, n, 0)
+    if checkpoints is not None and n > 0 and _compiles_at_next_call(step):
+        state, steps, n = advance(state, 1, 0), steps.part(n - 1, 1), n - 1
+    if checkpoints is None or n == 0:
+        return advance(state, n, 0)
     if isinstance(step, Step):
         state = step.prepare(state)
-    if kept.states is not None:
-        return binomial(single, state, n, kept.states, step)
-    return in_segments(single, state, n, kept, step)
+    if checkpoints.states is not None:
+        return binomial(advance, state, n, checkpoints.states, step)
+    return in_segments(advance, state, n, checkpoints, step)
 
 
-def _begins_to_keep(step: Any) -> bool:
-    """Whether a compiled step has never been called. What it makes at the first call, and keeps, is an argument of the
-    code that is compiled for later ones: called again, that would keep other tensors for the backward pass."""
+def _compiles_at_next_call(step: Any) -> bool:
+    """Whether a step for `torch.compile` has never been called.
+
+    Its first call is not recomputed: it creates the status of the step, which is an argument of the code compiled for
+    later calls, so that a recomputed first call would save other tensors for the backward pass.
+    """
     if not isinstance(step, torch.nn.Module):
         return False
     modules = list(step.modules())

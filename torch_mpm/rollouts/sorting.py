@@ -1,4 +1,4 @@
-"""Rollouts of unsorted particles: sorted before many steps, and restored to their order afterwards."""
+"""Order of particles: sorted before many steps, and restored after them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def restore_order(step: Step, end: State, start: State, given: State) -> State:
         step.law.reordered(start.material, given.material)
     ids, before, own = start.ids, _tensors(start), _tensors(given)
     assert ids is not None
-    found = {name: own.get(name) for name in _tensors(end)}  # Fields that steps do not change.
+    found = {name: own.get(name) for name in _tensors(end)}  # Those of fields that steps do not change remain.
     moved = {name: t for name, t in _tensors(end).items() if t is not None and t is not before.get(name)}
     place = torch.empty_like(ids).scatter_(0, ids, torch.arange(len(ids), device=ids.device))
     found |= dict(zip(moved, _take_all(list(moved.values()), place), strict=True))

@@ -29,16 +29,16 @@ class Steps(NamedTuple):
     first: int = 0
     """Index of the first step in the rollout."""
 
-    def some(self, n: int, first: int = 0) -> Steps:
-        """n of these steps, after `first` others."""
+    def part(self, n: int, first: int = 0) -> Steps:
+        """n of these steps, after the first `first` of them."""
         return Steps(self.step, n, self.dt, self.checkpoints, self.graph, self.schedule, self.first + first)
 
     def control(self, state: State) -> contextlib.AbstractContextManager[Leave]:
-        """Context in which obstacles move as they do in these steps."""
+        """Context of the motion of obstacles in these steps; its function returns the state with their final poses."""
         step: Any = self.step
         return control_step(step, state, self.n, self.dt)
 
     def call(self, state: State) -> contextlib.AbstractContextManager[Callable[[State], State]]:
-        """Context of `ErrorStatus.call`, in which these steps are one call."""
+        """Context of `ErrorStatus.call`, in which these steps are one call of the step; its function ends the call."""
         step: Any = self.step
         return step._error_status.call(state) if isinstance(step, Step) else contextlib.nullcontext(lambda state: state)

@@ -15,9 +15,10 @@ from ..ops.segment_clock import ALL_LEFT, SegmentClock, segment_clock
 from ..state.state import State
 from ..step.step import Step
 from .checkpoints import Checkpoints
+from .facts import facts_of, follows_paths
 from .fused_op import in_calls
 from .graph_replay import CHUNK, replay_all
-from .plan import RolloutPlan, check_plan, facts_of, follows_paths, plan_call, plan_of_steps
+from .plan import RolloutPlan, check_plan, plan_call, plan_of_steps
 from .run import rollout
 from .sorting import restore_order, sort_particles
 from .steps import Steps
@@ -118,13 +119,16 @@ def rollout_to(
     unsorted = plan_call(None, facts_of(Steps(step, 1, 1.0), given)._replace(steps=most)).order > 0
     start = sort_particles(step, given) if unsorted else given
     clocks = Clocks(step, start, time, cfl, longest, most, previous)
-    with step._error_status.call(state) as ended, control_step(step, start, most, PACE, clocks.seconds) as left:
+    with (
+        step._error_status.call(state) as end_call,
+        control_step(step, start, most, PACE, clocks.seconds) as end_motion,
+    ):
         while (counts := clocks.remaining()) and counts[-1] > every:
             clocks.advance(min((counts[-1] - 1) // every, MOST_SEGMENTS), every, options)
         clocks.finish(counts, options)
         arrival = clocks.arrival()
-        end = left(arrival.state)
-        return arrival._replace(state=ended(restore_order(step, end, start, given) if unsorted else end))
+        end = end_motion(arrival.state)
+        return arrival._replace(state=end_call(restore_order(step, end, start, given) if unsorted else end))
 
 
 def _compensated(step: Step, state: State, cfl: float, longest: float) -> State:
@@ -159,7 +163,7 @@ class Clocks:
         now = _per_scene("the time of the state", state.time, step.grid.scenes, state.x)
         latest = _per_scene("previous", 0.0 if previous is None else previous, step.grid.scenes, state.x)
         self.seconds: float | Tensor = (end - now).clamp(min=0)
-        """Remaining time at the beginning [s]."""
+        """Time to compute at the beginning [s]: a number, or [B] float64."""
         if not isinstance(time, Tensor) and not isinstance(state.time, Tensor):
             self.seconds = max(time - state.time, 0.0)
         self._end = time
@@ -170,7 +174,7 @@ class Clocks:
     @torch.no_grad()
     def remaining(self) -> list[int]:
         """Distinct numbers of remaining substeps of the scenes, in ascending order; waits for the device."""
-        self.state, _ = self._next(self.state, 0)
+        self.state, _ = self._begin_segment(self.state, 0)
         return [int(count) for count in self._clock.left.unique().tolist() if count > 0]
 
     def advance(self, segments: int, n: int, options: dict[str, Any]) -> None:
@@ -178,12 +182,12 @@ class Clocks:
         plan = self._plan_of_replays(n, options) if segments > LEAST_REPLAYS else None
         if plan is None:
             for _ in range(segments):
-                state, dt = self._next(self.state, n)
+                state, dt = self._begin_segment(self.state, n)
                 self.state = rollout(self.step, state, n, dt, **options)
             return
 
         def segment(state: State) -> State:
-            state, dt = self._next(state, n)
+            state, dt = self._begin_segment(state, n)
             return in_calls(Steps(self.step, n, dt), state, plan)
 
         # The first one allocates the status of steps.
@@ -191,11 +195,11 @@ class Clocks:
 
     def finish(self, counts: list[int], options: dict[str, Any]) -> None:
         """Last substeps of each scene, as counted by `remaining`; options of `rollout`."""
-        taken, clock = 0, self._clock
+        computed, clock = 0, self._clock
         for count in counts:
             dt = torch.where(clock.left >= count, clock.step, 0.0).to(self.state.x.dtype)
-            self.state = rollout(self.step, self.state, count - taken, dt, **options)
-            taken = count
+            self.state = rollout(self.step, self.state, count - computed, dt, **options)
+            computed = count
         self._update(None, ALL_LEFT)
 
     def _plan_of_replays(self, n: int, options: dict[str, Any]) -> RolloutPlan | None:
@@ -208,10 +212,10 @@ class Clocks:
         plan = plan_of_steps(Steps(step, n, self._clock.step.to(state.x.dtype), schedule=schedule), state)
         if plan.executor != "fused" or plan.facts is None or plan.facts.gradients:
             return None
-        return plan.of_sorted()  # or not worth a sort
+        return plan.of_sorted()  # The particles are sorted, or sorting does not pay.
 
     @torch.no_grad()
-    def _next(self, state: State, n: int) -> tuple[State, Tensor]:
+    def _begin_segment(self, state: State, n: int) -> tuple[State, Tensor]:
         """State at its time, and dt of its next n substeps: zero for scenes with at most n remaining."""
         state = self._at_its_time(state)
         self._update(self._rate(state), n)
@@ -219,6 +223,7 @@ class Clocks:
 
     @torch.no_grad()
     def arrival(self) -> RolloutToResult:
+        """The result, once no scene has substeps left."""
         clock = self._clock
         state = self._at_its_time(self.state)
         self._update(self._rate(state), 0, choose=False)

@@ -190,8 +190,8 @@ def _check_fields(scene: Any, state: State) -> None:
     values = {"F": state.F, "J": state.J, "temperature": state.temperature, "liquid": state.extra.get(LIQUID)}
     absent = [name for name in scene.trajectory_fields if name in values and values[name] is None]
     if absent:
-        asked = set(scene.output.fields)
-        keys = {name: "output.fields" if name in asked else "render.color_by" for name in absent}
+        requested = set(scene.output.fields)
+        keys = {name: "output.fields" if name in requested else "render.color_by" for name in absent}
         raise SceneError([f"{key}: no material of this scene has {name!r}" for name, key in keys.items()])
 
 

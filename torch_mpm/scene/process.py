@@ -23,25 +23,25 @@ class StopSignals:
     A signal after the last frame is sent again at the end of the context.
 
     Attributes:
-        asked: number of the last signal; 0 for none.
+        signal: number of the last signal; 0 for none.
     """
 
     def __init__(self) -> None:
-        self.asked = 0
+        self.signal = 0
         self._raise_later: RaiseLater | None = None
         self._previous: dict[int, Any] = {}
 
     def __enter__(self) -> StopSignals:
         with contextlib.suppress(ValueError):  # Only the main thread may handle signals.
             for number in (signal.SIGINT, signal.SIGTERM):
-                self._previous[number] = signal.signal(number, self._ask)
+                self._previous[number] = signal.signal(number, self._request)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
         for number, handler in self._previous.items():
             signal.signal(number, handler)
-        if self.asked and kind is None:
-            signal.raise_signal(self.asked)
+        if self.signal and kind is None:
+            signal.raise_signal(self.signal)
 
     @contextlib.contextmanager
     def within_frames(self) -> Iterator[None]:
@@ -52,10 +52,10 @@ class StopSignals:
             finally:
                 self._raise_later = None
 
-    def _ask(self, number: int, frame: FrameType | None) -> None:
-        if self.asked and number == signal.SIGINT:
+    def _request(self, number: int, frame: FrameType | None) -> None:
+        if self.signal and number == signal.SIGINT:
             raise KeyboardInterrupt
-        self.asked = number
+        self.signal = number
         if self._raise_later is not None:
             self._raise_later(KeyboardInterrupt, FRAME_SECONDS)
 

@@ -322,7 +322,7 @@ class Simulation:
         return self.state.x.is_cuda
 
     def _check_stop(self, stop: StopSignals) -> None:
-        if self.frame < self.scene.frames and stop.asked:
+        if self.frame < self.scene.frames and stop.signal:
             raise self.interrupted()
 
     def interrupted(self) -> Interrupted:

@@ -103,15 +103,15 @@ class Failures:
 
     def sentences(self) -> list[str]:
         """A sentence for each kind of problem found; synchronises."""
-        told, explained = self._of_given()
+        sentences, explained = self._of_given()
         others = list(explained)
         for kind, problem in sorted(self.problems.items(), key=lambda item: item[0] in CONSEQUENCES):
             without = others if kind in CONSEQUENCES else explained if kind == LOST else [False] * len(others)
             sentence = problem.told(without)
             if sentence:
-                told.append(sentence)
+                sentences.append(sentence)
                 others = [a or count > 0 for a, count in zip(others, problem.count.tolist(), strict=True)]
-        return told
+        return sentences
 
     def _of_given(self) -> tuple[list[str], list[bool]]:
         """Sentences about the first state, in scenes with failures like those of a large time step; and the kinds it
@@ -121,13 +121,13 @@ class Failures:
         for kind in (LOST, *CONSEQUENCES):
             if kind in self.problems:
                 fine = [a and count == 0 for a, count in zip(fine, self.problems[kind].count.tolist(), strict=True)]
-        told, explained = list[str](), [False] * len(fine)
+        sentences, explained = list[str](), [False] * len(fine)
         for problem in self.given.values():
             if sentence := problem.told(fine):
-                told.append(sentence)
+                sentences.append(sentence)
                 counts = problem.count.tolist()
                 explained = [a or (count > 0 and not b) for a, count, b in zip(explained, counts, fine, strict=True)]
-        return told, explained
+        return sentences, explained
 
 
 def problems_of_status(statuses: Iterable[Tensor], grid: Grid) -> dict[str, Problem]:

@@ -33,8 +33,8 @@ from ..ops import Survey, fusible, g2p, gather, grid_update, p2g, wall_impulses
 from ..ops.arguments import check_choice, soa_empty
 from ..ops.contact import MAX_OBSTACLES
 from ..ops.g2p_advance import g2p_advance_compensated
+from ..ops.precision import from_half, full_precision
 from ..ops.transfer import STRESS_FORMS
-from ..precision import from_half, full_precision
 from ..state.state import State, check_state, identity_deformation
 from .clocks import time_after
 from .failures import Failures, problems_of_state, raise_failures

@@ -58,7 +58,7 @@ struct SceneState {
   int more_room;
 };
 
-// Contact of the nodes of a scene that meet several surfaces, from their velocities before that. By all threads.
+// Contact of the nodes of a scene that meet several surfaces, from their velocities before it. Called by all threads.
 template <class T, int D>
 __device__ __noinline__ void add_contact(const GridUpdateArguments<T, D>& update, const ContactArguments<T, D>& contact,
                                          NodeRow<T, D>* rows, int nodes) {

@@ -141,7 +141,7 @@ struct NodeVelocities {
   }
 };
 
-// Contact of the nodes that meet several surfaces, from their velocities before that. By all threads.
+// Contact of the nodes that meet several surfaces, from their velocities before it. Called by all threads.
 template <class S, class T, int D>
 __device__ __noinline__ void add_contact(const TileNodes<S>& nodes,
                                          const NodeVelocities<Contacts::several_surfaces, T, D>& velocities,
@@ -185,7 +185,7 @@ class ItemStep {
                       ItemMemory<S>& memory_of_item, char* memory)
       : source(source), task(task), update(update), m(memory_of_item), memory(memory) {}
 
-  // By all threads, after they have finished the previous item.
+  // Called by all threads, after they have finished the previous item.
   __device__ void begin(int number) {
     const Schedule<const int> schedule = schedule_of(topology());
     const int4 e = reinterpret_cast<const int4*>(schedule.items)[number];

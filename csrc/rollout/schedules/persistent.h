@@ -22,22 +22,22 @@ constexpr int kItemsOfProcessor = D == 2 ? 2 : 1;
 
 constexpr int kMostPersistentItems = 1024;  // of thread blocks that run at once
 
-// What the kernel for nodes that meet one surface leaves to that for several. Zero before each activation.
+// Work that the kernel for nodes with one surface hands over to that for several surfaces. Zeroed before an activation.
 struct Handover {
   int requested;
   int lost;   // whether the activation has lost a particle
-  int steps;  // 1 + substeps of the activation that the other kernel has computed; 0 where this one has nothing to do
-  int incomplete[kMostPersistentItems];  // whether the G2P of the last substep has yet to be computed, of each item
+  int steps;  // 1 + substeps of the activation that the other kernel has computed; 0 where this one has no work
+  int incomplete[kMostPersistentItems];  // per item: whether the G2P of the last substep is not computed yet
 
 #ifdef __CUDACC__
-  // By a thread of a thread block with an incomplete item. Its displacement stops all thread blocks at the next
-  // barrier.
+  // Called by a thread of a thread block with an incomplete item. Its displacement stops all thread blocks at the
+  // next barrier.
   __device__ void request(Displacement& displacement) {
     incomplete[blockIdx.x] = 1;
     atomicOr(&requested, 1);
     atomicOr(&displacement.lost, kRequest);
   }
-  // By all thread blocks after that barrier, with their displacement before it.
+  // Called by all thread blocks after that barrier, with their displacement before it.
   __device__ bool is_requested() const { return *const_cast<const volatile int*>(&requested); }
   __device__ void end(const Displacement& displacement) {
     if (displacement.lost & ~kRequest) atomicOr(&lost, 1);

@@ -252,7 +252,7 @@ bool SortedCpu<T, D>::step(const int* status_before, int* status, int64_t follow
   return true;
 }
 
-// From an activation to the nodes.
+// Activation, laws and P2G of a substep that no pass computes.
 template <class T, int D>
 bool SortedCpu<T, D>::begin(const int* status_before, int* status, int64_t following) {
   s_.activation.x = x.now();
