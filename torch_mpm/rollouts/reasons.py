@@ -113,7 +113,7 @@ def why_not_replay(steps: Steps, state: State) -> str | None:
         return "the time of the state is a tensor"
     if torch.is_grad_enabled() and any(t.requires_grad for t in (*tensors_of(state).values(), *_all_of(step))):
         return "it is differentiated"
-    if (reason := _foreign(step, state.x.device, [])) is not None:
+    if (reason := _foreign(step, state.x.device, {})) is not None:
         return reason
     return f"there are no more than {LEAST_STEPS} steps" if steps.n <= LEAST_STEPS else None
 
@@ -136,13 +136,16 @@ _OWN = (DeviceConstantCache, CapturedGraphs, ErrorStatus, Grid)
 """Types of the library that graphs support."""
 
 
-def _foreign(part: Any, device: torch.device, seen: list[Any]) -> str | None:
-    """Description of a user object, or of a tensor on another device, in a step or a part of it; None without one."""
-    if part is None or isinstance(part, NUMBERS) or type(part) in _OWN or any(part is known for known in seen):
+def _foreign(part: Any, device: torch.device, seen: dict[int, Any]) -> str | None:
+    """Description of a user object, or of a tensor on another device, in a step or a part of it; None without one.
+
+    `seen` has the parts that were checked before, by their ids.
+    """
+    if part is None or isinstance(part, NUMBERS) or type(part) in _OWN or id(part) in seen:
         return None
     if isinstance(part, Tensor):
         return None if part.device == device else f"a tensor of it is on {part.device}, the particles on {device}"
-    seen.append(part)
+    seen[id(part)] = part
     if type(part) in (dict, collections.OrderedDict):
         members = list(part.values())
     elif type(part) in (list, tuple, set) or (_is_known(part) and isinstance(part, tuple)):
