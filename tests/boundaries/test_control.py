@@ -107,6 +107,13 @@ def by_hooks(step: mpm.Step, paddle: mpm.Box, state: mpm.State, poses: list[Tens
     return mpm.frames(step, state, N * len(poses), DT, every=N, hook=control, truncate=7).end
 
 
+def by_frames(step: mpm.Step, paddle: mpm.Box, state: mpm.State, poses: list[Tensor]) -> mpm.State:
+    for pose in poses:
+        paddle.position = pose
+        state = mpm.frames(step, state, N, DT, every=7).end  # without a hook: one control step
+    return state
+
+
 def by_norms(step: mpm.Step, paddle: mpm.Box, state: mpm.State, poses: list[Tensor]) -> mpm.State:
     for pose in poses:
         paddle.position = pose
@@ -141,7 +148,7 @@ class Nothing(torch.nn.Module):
 
 WAYS = {
     "rollouts": by_rollouts, "numbers": by_numbers, "in place": in_place, "environments": by_environments,
-    "hooks": by_hooks, "parts": by_norms, "a module": in_a_module, "graphs": by_graphs,
+    "hooks": by_hooks, "frames": by_frames, "parts": by_norms, "a module": in_a_module, "graphs": by_graphs,
 }  # fmt: skip
 
 
@@ -226,6 +233,68 @@ def test_paths_without_a_derivative_are_differenced(path, run, device):
             state = mpm.rollout(step, state, n, DT)
         ends.append(state)
     assert_alike(*ends, 1e-8)
+
+
+def vector(x: float, y: float) -> Tensor:
+    return torch.tensor([x, y], dtype=F64)
+
+
+ONE_TIME = {
+    "numbers": lambda t: (0.35 + V * float(t), 0.25),
+    "array": lambda t: np.array([0.35 + V * t.item(), 0.25]),
+    "first axis": lambda t: torch.stack([0.35 + V * t, torch.full_like(t, 0.25)]),
+    "last axis": lambda t: torch.stack([0.35 + V * t, torch.full_like(t, 0.25)], -1),
+    "time times a vector": lambda t: vector(0.35, 0.25).to(t) + t * vector(V, 0.0).to(t),
+    "one row": lambda t: vector(0.35, 0.25)[None].to(t) + t * vector(V, 0.0)[None].to(t),
+    "row of a scene": lambda t: vector(0.35, 0.25)[None].to(t) + t[..., None] * vector(V, 0.0)[None].to(t),
+}
+
+
+@pytest.mark.parametrize("run", ["rollout", "steps", "to", "torch operations"])
+@pytest.mark.parametrize("scenes", [1, 2, 3])
+@pytest.mark.parametrize("path", ONE_TIME)
+def test_paths_of_one_time_serve_scenes_with_times_of_their_own(path, scenes, run, device):
+    """Whatever the number of scenes is, also that of the dimensions."""
+    dt = DT * torch.arange(1, scenes + 1, dtype=F64, device=device)
+
+    def end(**motion: Any) -> mpm.State:
+        paddle = box(motion.pop("position", (0.35, 0.25)), **motion)
+        if run == "torch operations":
+            paddle = mpm.boundaries.Obstacle(
+                mpm.shapes.SDF(mpm.shapes.Box((0.1, 0.6)).signed_distance), paddle.position, velocity=paddle.velocity
+            )
+        step = step_with(paddle, scenes=scenes)
+        state = mpm.State.concatenate([block(device=device)] * scenes, scene=True)
+        if run == "to":
+            return mpm.rollout_to(step, state, 60 * dt, longest=1e-3).state
+        if run == "rollout":
+            return mpm.rollout(step, state, 120, dt)
+        state = state.replace(time=torch.zeros(scenes, dtype=F64, device=device))
+        for _ in range(80):
+            state = step(state, dt)
+        return state
+
+    assert_alike(end(position=ONE_TIME[path]), end(velocity=(V, 0.0)), 1e-6)
+
+
+def test_paths_with_rows_of_scenes(device):
+    """Rows of all scenes, for one time or for that of each scene."""
+    speed = torch.tensor([1.0, 2.0], dtype=F64, device=device)
+    start = torch.tensor([0.35, 0.36], dtype=F64, device=device)
+    time = torch.tensor([0.1, 0.3], dtype=F64, device=device)
+    expected = torch.stack([start + speed * time, torch.full_like(start, 0.25)], -1)
+    for path in (
+        lambda t: (start + speed * t, 0.25),
+        lambda t: torch.stack([start + speed * t, torch.full_like(start, 0.25)], -1),
+        lambda t: torch.stack([start, 0.25 + 0 * start], -1) + t[:, None] * torch.stack([speed, 0 * speed], -1),
+    ):
+        torch.testing.assert_close(box(path).pose(time, start).centre, expected)
+        arm = torch.zeros(2, 2, dtype=F64, device=device)
+        scene = torch.arange(2, dtype=torch.int32, device=device)
+        rate = box(path).velocity_at(arm, scene, time)
+        torch.testing.assert_close(rate, torch.stack([speed, torch.zeros_like(speed)], -1))
+    with pytest.raises(ValueError, match=r"position must return \[D\] or \[B, D\] at a time, with B = 2, got \[3, 2\]"):
+        box(lambda t: torch.zeros(3, 2, dtype=F64, device=device)).pose(time, start)
 
 
 def test_a_path_that_returns_no_position():

@@ -11,17 +11,13 @@ from torch import Tensor
 
 from ..errors import shape_of
 from ..geometry.per_scene import SceneParameters, per_node
-from ..geometry.values import Value, as_value, finite, shape_of_value
+from ..geometry.timed import REFUSALS, Path, vector_at
+from ..geometry.values import Value, finite, shape_of_value
 from ..geometry.vectors import norm, transform
 from .waypoints import Waypoints
 
-Path = Callable[[Tensor], Value]
-"""A position as a function of time, [] or [B] to [D] or [B, D], in the forms of `geometry.values.Value`."""
 PACE = 1e-4
 """Time over which a path without a derivative is differenced, unless a step sets it [s]."""
-
-REFUSALS = RuntimeError, TypeError, ValueError
-"""Errors of functions of numbers that are given a tensor of a torch transform as the time."""
 
 
 class Pose(NamedTuple):
@@ -44,7 +40,7 @@ class RigidMotion(SceneParameters):
 
     Args:
         position: of its centre at time `start` [m]: [D] or [B, D] in any form of `geometry.values.Value`, or a function
-            of the time, a tensor [] or [B], that returns one of these.
+            of the time that returns one of these, see `geometry.timed.vector_at`.
         velocity: of its centre [m/s], [D] or [B, D]; None where position is a function.
         rotation: orientation at time `start` [rad]: an angle (2-D) or a rotation vector (3-D), about the centre.
         angular_velocity: [rad/s], in the same forms.
@@ -166,14 +162,9 @@ class RigidMotion(SceneParameters):
         return centre.to(like.dtype).reshape(shape), rates.to(like.dtype).reshape(shape)
 
     def at(self, time: Tensor) -> Tensor:
-        """The position that a function of time returns, as a tensor.
-
-        Raises:
-            TypeError: for a result that is neither a tensor nor numbers.
-        """
+        """The position that a function of time returns, as a tensor; see `geometry.timed.vector_at`."""
         assert callable(self.motion.position)
-        value = self.motion.position(time)
-        return value if isinstance(value, Tensor) else _as_position(value, time)
+        return vector_at("position", self.motion.position, time)
 
     def _mapped(self, times: Tensor) -> Tensor:
         try:
@@ -234,16 +225,6 @@ class RigidMotion(SceneParameters):
     def _elapsed(self, time: float | Tensor, like: Tensor) -> float | Tensor:
         """Time since `start`, [] or [B]."""
         return (time - self.start).to(like.dtype) if isinstance(time, Tensor) else time - self.start
-
-
-def _as_position(value: Any, time: Tensor) -> Tensor:
-    """Position [D] or [B, D] that a function of time returns in another form than a tensor."""
-    if value is None or isinstance(value, str):
-        raise TypeError(f"position must return a tensor, an array or numbers at a time, got {shape_of(value)}")
-    position = as_value("the result of position", value, time)
-    if isinstance(position, Tensor):
-        return position
-    return torch.tensor(position, dtype=torch.float64, device="cpu").to(time.device, non_blocking=True)
 
 
 def to_body(rotation: Tensor | None, arm: Tensor) -> Tensor:
