@@ -520,6 +520,19 @@ def test_copies_of_environments_know_their_obstacles(device):
     assert_alike(again.state, envs.state)
 
 
+def test_an_obstacle_twice_in_the_list_is_one(device):
+    def end(times: int) -> mpm.State:
+        paddle = box(start(device=device))
+        step = mpm.Step(grid_of(), LAW, walls="separate", boundaries=[paddle] * times)
+        state = mpm.rollout(step, block(device=device), 1, DT)
+        for k in range(1, 4):
+            paddle.position = at(k, device=device)
+            state = mpm.rollout(step, state, N, DT)
+        return state
+
+    assert_alike(end(2), end(1))
+
+
 @pytest.mark.parametrize("made", [copy.copy, copy.deepcopy, lambda o: pickle.loads(pickle.dumps(o))])
 def test_a_copy_beside_an_obstacle_is_one_of_its_own(made):
     first = box((0.2, 0.25), velocity=(0.01, 0.0))
