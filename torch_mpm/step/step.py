@@ -406,9 +406,10 @@ class Step(TensorModule):
         """A state whose particles inside obstacles are moved to the nearest point of free space, and how many of each
         scene were.
 
-        Particles may be found inside after seeding, or where an obstacle appears. They are pushed out slowly, with
-        stress, or not at all where they are deep; a particle that was moved keeps all else that it has. Obstacles are
-        where they are at `state.time`; those on which hooks or an `apply` of their own act are left alone. Without
+        One that is deeper than 3 dx inside several obstacles may be moved to a point of free space that is not the
+        nearest. Particles may be found inside after seeding, or where an obstacle appears. They are pushed out slowly,
+        with stress, or not at all where they are deep; a particle that was moved keeps all else that it has. Obstacles
+        are where they are at `state.time`; those on which hooks or an `apply` of their own act are left alone. Without
         gradient; nothing here synchronises with a GPU.
 
         Returns:
