@@ -49,6 +49,7 @@ class Timed(TensorModule):
         for name, value in (("start", start), ("end", end)):
             if not isinstance(value, Tensor):
                 check_number(name, value, "a number", lambda v: v == v, "a number or a tensor")
+            _refuse_grad(name, value)
         if particles is not None and (not isinstance(particles, Tensor) or particles.dtype != torch.bool):
             found = particles.dtype if isinstance(particles, Tensor) else shape_of(particles)
             raise TypeError(f"particles must be bool [P], got {found}")
@@ -65,6 +66,8 @@ class Timed(TensorModule):
         time = state.time
         if isinstance(time, Tensor) and time.numel() > 1:
             time = per_particle(time, state.scene, len(state))
+        for name in ("start", "end"):
+            _refuse_grad(name, getattr(self, name))
         start, end = (of_particles(name, getattr(self, name), state, (len(state),)) for name in ("start", "end"))
         if any(isinstance(t, Tensor) for t in (time, start, end)):
             return (time >= start) & (time < end)
@@ -186,6 +189,12 @@ def of_particles(name: str, value: Any, state: State, shape: tuple[int, ...]) ->
     if tuple(value.shape) not in ((), shape[1:]):
         raise ValueError(f"{name} must have shape {list(shape[1:])} or {list(whole)}, got {shape_of(value)}")
     return value
+
+
+def _refuse_grad(name: str, value: Any) -> None:
+    """Raise for a tensor by which particles are selected, and whose gradient would be lost."""
+    if isinstance(value, Tensor) and value.requires_grad:
+        raise ValueError(f"{name} must not require grad: which particles are affected is not differentiable")
 
 
 def _checked_vector(name: str, value: Any) -> Any:
