@@ -297,6 +297,55 @@ def test_paths_with_rows_of_scenes(device):
         box(lambda t: torch.zeros(3, 2, dtype=F64, device=device)).pose(time, start)
 
 
+WRONG_PATHS = {
+    "three numbers": (
+        lambda t: (0.4, 0.4, 0.4),
+        ValueError,
+        r"position must return \[2\] or \[B, 2\] at a time, got \[3\]",
+    ),
+    "one number": (lambda t: 0.4, ValueError, r"position must return \[D\] or \[B, D\] at a time, got \[\]"),
+    "bool": (
+        lambda t: torch.tensor([True, False]),
+        TypeError,
+        "position must return real numbers at a time, got torch.bool",
+    ),
+    "complex": (lambda t: torch.tensor([0.4j, 0.4]), TypeError, "position must return real numbers at a time"),
+    "NaN": (lambda t: (np.nan, 0.4), ValueError, "position must return finite numbers at a time"),
+    "infinite": (
+        lambda t: torch.stack([0.4 / (0 * t), t]),
+        ValueError,
+        "position must return finite numbers at a time",
+    ),
+}
+
+
+@pytest.mark.parametrize("run", ["rollout", "steps", "to", "environments"])
+@pytest.mark.parametrize("path", WRONG_PATHS)
+def test_wrong_results_of_paths_are_told(path, run):
+    given, error, message = WRONG_PATHS[path]
+    step = step_with(box(given), scenes=2)
+    with pytest.raises(error, match=message):
+        state = mpm.State.concatenate([block()] * 2, scene=True)
+        if run == "rollout":
+            mpm.rollout(step, state, 3, DT)
+        elif run == "steps":
+            step(state, DT)
+        elif run == "to":
+            mpm.rollout_to(step, state, 3 * DT)
+        else:
+            mpm.Environments(step, [block()] * 2).advance(3, DT)
+
+
+def test_a_path_need_not_be_finite_while_its_obstacle_is_away():
+    def path(t: Tensor) -> Tensor:
+        return torch.stack([0.35 + torch.where(t < 10.5 * DT, V * t, torch.nan), 0.25 + 0 * t])
+
+    brief, still = box(path, end=10 * DT), box((0.35, 0.25), velocity=(V, 0.0), end=10 * DT)
+    for dt in (DT, torch.full((1,), DT, dtype=F64)):
+        ends = [mpm.rollout(step_with(paddle), block(), 40, dt) for paddle in (brief, still)]
+        torch.testing.assert_close(ends[0].x, ends[1].x, rtol=0, atol=1e-12)
+
+
 def test_a_path_that_returns_no_position():
     step = step_with(box(lambda t: "here"))
     with pytest.raises(TypeError, match="position must return a tensor, an array or numbers at a time, got str"):

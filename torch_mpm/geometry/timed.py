@@ -70,11 +70,14 @@ def _of_scenes(name: str, function: Path, time: Tensor) -> Tensor:
 
 def _as_vector(name: str, value: Any, time: Tensor) -> Tensor:
     """What a function has returned, as a tensor."""
-    if isinstance(value, Tensor):
-        return value
     if value is None or isinstance(value, str):
         raise TypeError(f"{name} must return a tensor, an array or numbers at a time, got {shape_of(value)}")
-    vector = as_value(f"the result of {name}", value, time)
-    if isinstance(vector, Tensor):
-        return vector
-    return torch.tensor(vector, dtype=torch.float64, device="cpu").to(time.device, non_blocking=True)
+    if not isinstance(value, Tensor):
+        value = as_value(f"the result of {name}", value, time)
+    if not isinstance(value, Tensor):
+        value = torch.tensor(value, dtype=torch.float64, device="cpu").to(time.device, non_blocking=True)
+    if value.is_complex() or value.dtype == torch.bool:
+        raise TypeError(f"{name} must return real numbers at a time, got {value.dtype}")
+    if value.dim() == 0:
+        raise ValueError(f"{name} must return [D] or [B, D] at a time, got []")
+    return value
