@@ -3,6 +3,7 @@
 import copy
 import io
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -100,6 +101,7 @@ WAYS = (
 )
 FORMS = {
     "number": lambda dt, x: dt,
+    "number of NumPy": lambda dt, x: np.float32(dt),
     "[]": lambda dt, x: x.new_full((), dt),
     "[1]": lambda dt, x: x.new_full((1,), dt),
     "[B]": lambda dt, x: x.new_full((2,), dt),

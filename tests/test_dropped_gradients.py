@@ -30,6 +30,16 @@ def sized(box: mpm.Box, size: Any) -> Any:
     return mpm.rollout(mpm.Step(GRID, LAW, boundaries=[box]), state(), 2, 1e-3)
 
 
+def ended(operation: particle_operations.Hold, end: Any) -> Any:
+    operation.end = end
+    return mpm.rollout(mpm.Step(GRID, LAW, on_particles=operation), state(), 2, 1e-3)
+
+
+def walled(walls: mpm.Walls, friction: Any) -> Any:
+    walls.friction = friction
+    return mpm.rollout(mpm.Step(GRID, LAW, walls=walls), state(), 2, 1e-3)
+
+
 def wanted(values: Any) -> Tensor:
     return torch.tensor(values, requires_grad=True)
 
@@ -42,6 +52,21 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
     "samples": (
         lambda: shapes.Sampled(torch.ones(3, 3, requires_grad=True), (0, 0), 0.1),
         "values must not require grad",
+    ),
+    "assigned samples": (
+        lambda: setattr(
+            shapes.Sampled.of(shapes.Sphere(0.1), (-0.3, -0.3), (0.3, 0.3), 0.1), "values", wanted([[1.0, 1.0]] * 2)
+        ),
+        "values must not require grad",
+    ),
+    "start of a push": (lambda: particle_operations.Push((1.0, 0.0), wanted(0.5)), "start must not require grad"),
+    "assigned end of a hold": (
+        lambda: ended(particle_operations.Hold((1.0, 0.0)), wanted(0.5)),
+        "end must not require grad",
+    ),
+    "assigned friction of walls": (
+        lambda: walled(mpm.Walls("slip"), wanted(0.5)),
+        "use a Plane for friction with a gradient",
     ),
     "sampled shape": (
         lambda: shapes.Sampled.of(shapes.Capsule(wanted([0.1, 0.0]), 0.1), (-0.3, -0.3), (0.3, 0.3), 0.1),

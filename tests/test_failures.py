@@ -218,6 +218,10 @@ def test_inputs_with_nan_explain_a_failure(part, device):
         words, scenes = words + " at the time of the state", [0, 1]
     else:
         rates[part == "angular_velocity"][1] = torch.nan
+    if part == "path" and device == "cpu":
+        with pytest.raises(ValueError, match="position must return finite numbers at a time"):
+            mpm.rollout(step, state, 4, 1e-3)
+        return
     state = mpm.rollout(step, state, 4, 1e-3)
     assert step.failures(state).failed.nonzero().flatten().tolist() == scenes
     with pytest.raises(mpm.SimulationError) as caught:

@@ -52,6 +52,35 @@ def test_scenes_have_their_own_time_steps(device):
     torch.testing.assert_close(paused.split()[0].x, end.split()[0].x, rtol=0, atol=1e-13)
 
 
+FORCES = {
+    "time times a vector": lambda t, x: t * torch.arange(1.0, 1.0 + x.shape[1]).to(x),
+    "numbers": lambda t, x: tuple(float(t) * k for k in range(1, 1 + x.shape[1])),
+    "components": lambda t, x: torch.stack([torch.as_tensor(k * t).to(x) for k in range(1, 1 + x.shape[1])]),
+    "of particles": lambda t, x: torch.as_tensor(t).to(x) * x,
+}
+
+
+@pytest.mark.parametrize("scenes", [1, 2, 3])
+@pytest.mark.parametrize("force", FORCES)
+def test_forces_of_one_time_serve_scenes_with_times_of_their_own(force, scenes, dim, device):
+    """Whatever the number of scenes is, also that of the dimensions; also for reordered particles."""
+    start = block_state(dim, device)
+    dt = DT * torch.arange(1, scenes + 1, dtype=torch.float64, device=device)
+
+    def change(B: int, dt: torch.Tensor | float) -> torch.Tensor:
+        states = mpm.State.concatenate([start] * B, scene=True) if B > 1 else start
+        turned = states.select(torch.arange(len(states) - 1, -1, -1, device=device))
+        turned = turned.replace(ids=torch.arange(len(states) - 1, -1, -1, device=device))
+        push = Push(lambda time: FORCES[force](time, states.x))
+        step = make_step(dim, scenes=B, on_particles=push)
+        ends = mpm.rollout(step, states, 4, dt), mpm.rollout(step, turned, 4, dt).restored()
+        torch.testing.assert_close(ends[0].v, ends[1].v, rtol=1e-9, atol=1e-10)
+        return ends[0].v
+
+    expected = torch.cat([change(1, float(own)) for own in dt])
+    torch.testing.assert_close(change(scenes, dt), expected, rtol=1e-9, atol=1e-10)
+
+
 def test_held_particles_have_their_velocity_and_are_let_go_in_turn(device):
     """Before P2G of each step; in the order of `ids` after particles were sorted."""
     start = block_state(2, device)

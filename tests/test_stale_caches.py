@@ -135,7 +135,7 @@ KEPT = {
         of_law(lambda v: mpm.WeaklyCompressible(bulk_modulus=v)), "bulk_modulus", 1e5, 1e3, NO_NUMBERS
     ),
     "table": Kept(table, "value", [1e5, 2e5], [1e3, 2e3], NO_NUMBERS),
-    "gravity": Kept(gravity, "gravity", [0.0, -9.8], [9.0, 3.0], NO_NUMBERS),
+    "gravity": Kept(gravity, "gravity", [0.0, -9.8], [9.0, 3.0]),
     "held velocity": Kept(hold, "velocity", [1.0, 0.0], [0.0, 2.0]),
 }  # fmt: skip
 

@@ -107,6 +107,13 @@ def by_hooks(step: mpm.Step, paddle: mpm.Box, state: mpm.State, poses: list[Tens
     return mpm.frames(step, state, N * len(poses), DT, every=N, hook=control, truncate=7).end
 
 
+def by_frames(step: mpm.Step, paddle: mpm.Box, state: mpm.State, poses: list[Tensor]) -> mpm.State:
+    for pose in poses:
+        paddle.position = pose
+        state = mpm.frames(step, state, N, DT, every=7).end  # without a hook: one control step
+    return state
+
+
 def by_norms(step: mpm.Step, paddle: mpm.Box, state: mpm.State, poses: list[Tensor]) -> mpm.State:
     for pose in poses:
         paddle.position = pose
@@ -141,7 +148,7 @@ class Nothing(torch.nn.Module):
 
 WAYS = {
     "rollouts": by_rollouts, "numbers": by_numbers, "in place": in_place, "environments": by_environments,
-    "hooks": by_hooks, "parts": by_norms, "a module": in_a_module, "graphs": by_graphs,
+    "hooks": by_hooks, "frames": by_frames, "parts": by_norms, "a module": in_a_module, "graphs": by_graphs,
 }  # fmt: skip
 
 
@@ -226,6 +233,117 @@ def test_paths_without_a_derivative_are_differenced(path, run, device):
             state = mpm.rollout(step, state, n, DT)
         ends.append(state)
     assert_alike(*ends, 1e-8)
+
+
+def vector(x: float, y: float) -> Tensor:
+    return torch.tensor([x, y], dtype=F64)
+
+
+ONE_TIME = {
+    "numbers": lambda t: (0.35 + V * float(t), 0.25),
+    "array": lambda t: np.array([0.35 + V * t.item(), 0.25]),
+    "first axis": lambda t: torch.stack([0.35 + V * t, torch.full_like(t, 0.25)]),
+    "last axis": lambda t: torch.stack([0.35 + V * t, torch.full_like(t, 0.25)], -1),
+    "time times a vector": lambda t: vector(0.35, 0.25).to(t) + t * vector(V, 0.0).to(t),
+    "one row": lambda t: vector(0.35, 0.25)[None].to(t) + t * vector(V, 0.0)[None].to(t),
+    "row of a scene": lambda t: vector(0.35, 0.25)[None].to(t) + t[..., None] * vector(V, 0.0)[None].to(t),
+}
+
+
+@pytest.mark.parametrize("run", ["rollout", "steps", "to", "torch operations"])
+@pytest.mark.parametrize("scenes", [1, 2, 3])
+@pytest.mark.parametrize("path", ONE_TIME)
+def test_paths_of_one_time_serve_scenes_with_times_of_their_own(path, scenes, run, device):
+    """Whatever the number of scenes is, also that of the dimensions."""
+    dt = DT * torch.arange(1, scenes + 1, dtype=F64, device=device)
+
+    def end(**motion: Any) -> mpm.State:
+        paddle = box(motion.pop("position", (0.35, 0.25)), **motion)
+        if run == "torch operations":
+            paddle = mpm.boundaries.Obstacle(
+                mpm.shapes.SDF(mpm.shapes.Box((0.1, 0.6)).signed_distance), paddle.position, velocity=paddle.velocity
+            )
+        step = step_with(paddle, scenes=scenes)
+        state = mpm.State.concatenate([block(device=device)] * scenes, scene=True)
+        if run == "to":
+            return mpm.rollout_to(step, state, 60 * dt, longest=1e-3).state
+        if run == "rollout":
+            return mpm.rollout(step, state, 120, dt)
+        state = state.replace(time=torch.zeros(scenes, dtype=F64, device=device))
+        for _ in range(80):
+            state = step(state, dt)
+        return state
+
+    assert_alike(end(position=ONE_TIME[path]), end(velocity=(V, 0.0)), 1e-6)
+
+
+def test_paths_with_rows_of_scenes(device):
+    """Rows of all scenes, for one time or for that of each scene."""
+    speed = torch.tensor([1.0, 2.0], dtype=F64, device=device)
+    start = torch.tensor([0.35, 0.36], dtype=F64, device=device)
+    time = torch.tensor([0.1, 0.3], dtype=F64, device=device)
+    expected = torch.stack([start + speed * time, torch.full_like(start, 0.25)], -1)
+    for path in (
+        lambda t: (start + speed * t, 0.25),
+        lambda t: torch.stack([start + speed * t, torch.full_like(start, 0.25)], -1),
+        lambda t: torch.stack([start, 0.25 + 0 * start], -1) + t[:, None] * torch.stack([speed, 0 * speed], -1),
+    ):
+        torch.testing.assert_close(box(path).pose(time, start).centre, expected)
+        arm = torch.zeros(2, 2, dtype=F64, device=device)
+        scene = torch.arange(2, dtype=torch.int32, device=device)
+        rate = box(path).velocity_at(arm, scene, time)
+        torch.testing.assert_close(rate, torch.stack([speed, torch.zeros_like(speed)], -1))
+    with pytest.raises(ValueError, match=r"position must return \[D\] or \[B, D\] at a time, with B = 2, got \[3, 2\]"):
+        box(lambda t: torch.zeros(3, 2, dtype=F64, device=device)).pose(time, start)
+
+
+WRONG_PATHS = {
+    "three numbers": (
+        lambda t: (0.4, 0.4, 0.4),
+        ValueError,
+        r"position must return \[2\] or \[B, 2\] at a time, got \[3\]",
+    ),
+    "one number": (lambda t: 0.4, ValueError, r"position must return \[D\] or \[B, D\] at a time, got \[\]"),
+    "bool": (
+        lambda t: torch.tensor([True, False]),
+        TypeError,
+        "position must return real numbers at a time, got torch.bool",
+    ),
+    "complex": (lambda t: torch.tensor([0.4j, 0.4]), TypeError, "position must return real numbers at a time"),
+    "NaN": (lambda t: (np.nan, 0.4), ValueError, "position must return finite numbers at a time"),
+    "infinite": (
+        lambda t: torch.stack([0.4 / (0 * t), t]),
+        ValueError,
+        "position must return finite numbers at a time",
+    ),
+}
+
+
+@pytest.mark.parametrize("run", ["rollout", "steps", "to", "environments"])
+@pytest.mark.parametrize("path", WRONG_PATHS)
+def test_wrong_results_of_paths_are_told(path, run):
+    given, error, message = WRONG_PATHS[path]
+    step = step_with(box(given), scenes=2)
+    with pytest.raises(error, match=message):
+        state = mpm.State.concatenate([block()] * 2, scene=True)
+        if run == "rollout":
+            mpm.rollout(step, state, 3, DT)
+        elif run == "steps":
+            step(state, DT)
+        elif run == "to":
+            mpm.rollout_to(step, state, 3 * DT)
+        else:
+            mpm.Environments(step, [block()] * 2).advance(3, DT)
+
+
+def test_a_path_need_not_be_finite_while_its_obstacle_is_away():
+    def path(t: Tensor) -> Tensor:
+        return torch.stack([0.35 + torch.where(t < 10.5 * DT, V * t, torch.nan), 0.25 + 0 * t])
+
+    brief, still = box(path, end=10 * DT), box((0.35, 0.25), velocity=(V, 0.0), end=10 * DT)
+    for dt in (DT, torch.full((1,), DT, dtype=F64)):
+        ends = [mpm.rollout(step_with(paddle), block(), 40, dt) for paddle in (brief, still)]
+        torch.testing.assert_close(ends[0].x, ends[1].x, rtol=0, atol=1e-12)
 
 
 def test_a_path_that_returns_no_position():
@@ -449,6 +567,19 @@ def test_copies_of_environments_know_their_obstacles(device):
         own.position = own.position + torch.tensor([0.02, 0.0], dtype=F64, device=device)
         each.advance(N, DT)
     assert_alike(again.state, envs.state)
+
+
+def test_an_obstacle_twice_in_the_list_is_one(device):
+    def end(times: int) -> mpm.State:
+        paddle = box(start(device=device))
+        step = mpm.Step(grid_of(), LAW, walls="separate", boundaries=[paddle] * times)
+        state = mpm.rollout(step, block(device=device), 1, DT)
+        for k in range(1, 4):
+            paddle.position = at(k, device=device)
+            state = mpm.rollout(step, state, N, DT)
+        return state
+
+    assert_alike(end(2), end(1))
 
 
 @pytest.mark.parametrize("made", [copy.copy, copy.deepcopy, lambda o: pickle.loads(pickle.dumps(o))])

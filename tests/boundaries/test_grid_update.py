@@ -303,6 +303,12 @@ def test_messages():
     ]:
         with pytest.raises(error, match=message):
             mpm.Walls(*arguments)
+        walls = mpm.Walls()
+        for name, value in zip(("kind", "lower", "upper", "friction"), arguments, strict=False):
+            setattr(walls, name, value)
+        if "lower" not in message:  # which is compared with the grid
+            with pytest.raises(error, match=message):
+                grid_update(blocks, nodes, None, None, walls)
     with pytest.raises(NotImplementedError, match="vmap"):
         torch.vmap(lambda g: grid_update(blocks, nodes, g, 0.1))(torch.randn(4, 2, dtype=torch.float64))
 

@@ -559,6 +559,30 @@ def test_particles_inside_are_moved_to_the_nearest_surface_and_counted(device, d
     assert int(step.project(state)[1].sum()) == 0
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_particles_deep_inside_several_obstacles_are_moved_out_of_all(device, dim, dtype):
+    """Also where they are farther than nodes see from the nearest face: a seam in a block of two boxes, and bodies that
+    overlap."""
+    grid = mpm.Grid(DX, (0.0,) * dim, (1.0,) * dim)
+    x = 0.05 + 0.9 * torch.rand(300, dim, dtype=dtype, device=device)
+    points = mpm.seed.Points(x, torch.full_like(x[:, 0], 1e-4), None)
+    state, size = mpm.State.at_rest(points, 1000.0, dtype=dtype), (0.6,) * (dim - 1)
+    halves = [mpm.Box((at, *[0.5] * (dim - 1)), (0.35, *size)) for at in (0.325, 0.675)]
+    several = [mpm.Sphere((0.4, *[0.5] * (dim - 1)), 0.3), mpm.Box((0.6,) * dim, (0.5,) * dim)]
+    for obstacles in (halves, several):
+        step = mpm.Step(grid, mpm.NeoHookean(E=1e5, nu=0.3), boundaries=obstacles)
+        end, moved = step.project(state)
+        before, after = (torch.stack([o.signed_distance(s.x, None, 0.0) for o in obstacles]) for s in (state, end))
+        assert float(after.min()) > -1e-5
+        inside = before.amin(0) < -1e-5
+        assert abs(int(moved) - int(inside.sum())) <= 2  # rounding at the surface
+        assert torch.equal(end.x[before.amin(0) > 1e-5], state.x[before.amin(0) > 1e-5])
+        if obstacles is halves:
+            depth = torch.cat([0.35 - (x[:, :1] - 0.5).abs(), 0.3 - (x[:, 1:] - 0.5).abs()], 1).amin(1)
+            way = (end.x - x).norm(dim=1)
+            torch.testing.assert_close(way[inside], depth[inside], rtol=0, atol=0.051 * DX)
+
+
 # ---- thin walls
 
 

@@ -251,3 +251,29 @@ def test_solve_of_a_paused_scene_has_gradients(method):
     gradients = torch.autograd.grad(d.square().sum(), (capacity, theta, dt))
     for gradient, rows in zip(gradients, (paused, paused, [0]), strict=True):
         assert bool(gradient.isfinite().all()) and float(gradient[rows].abs().max()) == 0
+
+
+NUMBERS_OF_TIME = {
+    "tensor": lambda t: 300.0 + 1e3 * t,
+    "number": lambda t: 300.0 + 1e3 * float(t),
+    "tensor of a number": lambda t: torch.tensor(300.0 + 1e3 * float(t), dtype=torch.float64),
+}
+
+
+@pytest.mark.parametrize("function", NUMBERS_OF_TIME)
+@pytest.mark.parametrize("scenes", [1, 2, 3])
+def test_temperatures_of_one_time_serve_scenes_with_times_of_their_own(scenes, function):
+    points = mpm.seed.box((0.4, 0.4), (0.6, 0.6), 0.1, per_cell=4)
+    state = mpm.State.at_rest(points, 1000.0, dtype=torch.float64)
+    state = state.replace(temperature=torch.full_like(state.mass, 300.0))
+
+    def end(temperature, B, dt):
+        grid = mpm.Grid(0.1, (0.0, 0.0), (1.0, 1.0), scenes=B)
+        held = mpm.heat_boundaries.Fixed(mpm.Box((0.4, 0.5), (0.1, 0.5)), temperature)
+        step = mpm.Step(grid, mpm.NeoHookean(1e4, 0.3), heat=mpm.Heat(grid, 1000.0, 1000.0, boundaries=[held]))
+        return mpm.rollout(step, mpm.State.concatenate([state] * B, scene=True), 4, dt).temperature
+
+    dt = 1e-2 * torch.arange(1, scenes + 1, dtype=torch.float64)
+    expected = torch.cat([end(NUMBERS_OF_TIME["tensor"], 1, float(own)) for own in dt])
+    assert float(expected.max()) > 310
+    torch.testing.assert_close(end(NUMBERS_OF_TIME[function], scenes, dt), expected, rtol=1e-9, atol=0)

@@ -9,19 +9,15 @@ from typing import Any, ClassVar, NamedTuple
 import torch
 from torch import Tensor
 
-from ..errors import shape_of
+from ..cuda_graphs.capture import is_readable
 from ..geometry.per_scene import SceneParameters, per_node
-from ..geometry.values import Value, as_value, finite, shape_of_value
+from ..geometry.timed import REFUSALS, Path, vector_at
+from ..geometry.values import Value, finite, shape_of_value
 from ..geometry.vectors import norm, transform
 from .waypoints import Waypoints
 
-Path = Callable[[Tensor], Value]
-"""A position as a function of time, [] or [B] to [D] or [B, D], in the forms of `geometry.values.Value`."""
 PACE = 1e-4
 """Time over which a path without a derivative is differenced, unless a step sets it [s]."""
-
-REFUSALS = RuntimeError, TypeError, ValueError
-"""Errors of functions of numbers that are given a tensor of a torch transform as the time."""
 
 
 class Pose(NamedTuple):
@@ -44,7 +40,7 @@ class RigidMotion(SceneParameters):
 
     Args:
         position: of its centre at time `start` [m]: [D] or [B, D] in any form of `geometry.values.Value`, or a function
-            of the time, a tensor [] or [B], that returns one of these.
+            of the time that returns one of these, see `geometry.timed.vector_at`.
         velocity: of its centre [m/s], [D] or [B, D]; None where position is a function.
         rotation: orientation at time `start` [rad]: an angle (2-D) or a rotation vector (3-D), about the centre.
         angular_velocity: [rad/s], in the same forms.
@@ -110,7 +106,8 @@ class RigidMotion(SceneParameters):
         """Centre at a time, [D] or [B, D]."""
         motion = self.motion
         if self.follows_path:
-            return motion.at(_as_time(time, like)).to(like.dtype)
+            now = _as_time(time, like)
+            return motion._checked_path(now, motion.at(now), like).to(like.dtype)
         position = motion.parameter("position", like, shape_of_value(motion.value_of("position"))[-1:] or (1,))
         if motion.velocity is None:
             return position
@@ -148,8 +145,9 @@ class RigidMotion(SceneParameters):
 
     def _path(self, time: float | Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
         """Centre and its velocity, for a position that is a function of time."""
-        centre, velocity = self._moved(_as_time(time, like))
-        return centre.to(like.dtype), velocity.to(like.dtype)
+        now = _as_time(time, like)
+        centre, velocity = self._moved(now)
+        return self._checked_path(now, centre, like).to(like.dtype), velocity.to(like.dtype)
 
     def path_over(self, times: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
         """Centre and its velocity at many times [n] or [n, B]: [n, 1 or B, D], with the dtype of `like`.
@@ -157,23 +155,28 @@ class RigidMotion(SceneParameters):
         A function of time is called for all times at once if torch.vmap can map it, otherwise for one after another. It
         is called three times: for its value, its derivative and its difference.
         """
-        centre = self._mapped(times)
-        if centre.dim() not in (2, 3) or centre.shape[-1] != like.shape[1]:
-            expected = f"[{like.shape[1]}] or [B, {like.shape[1]}]"
-            raise ValueError(f"position must return {expected} at a time, got {shape_of(centre[0])}")
+        centre = self._checked_path(times, self._mapped(times), like)
         shape = len(times), -1, like.shape[1]
         rates = self._differenced(self._mapped, times, centre, self._rates(times, centre))
         return centre.to(like.dtype).reshape(shape), rates.to(like.dtype).reshape(shape)
 
     def at(self, time: Tensor) -> Tensor:
-        """The position that a function of time returns, as a tensor.
-
-        Raises:
-            TypeError: for a result that is neither a tensor nor numbers.
-        """
+        """The position that a function of time returns, as a tensor; see `geometry.timed.vector_at`."""
         assert callable(self.motion.position)
-        value = self.motion.position(time)
-        return value if isinstance(value, Tensor) else _as_position(value, time)
+        return vector_at("position", self.motion.position, time)
+
+    def _checked_path(self, times: Tensor, centre: Tensor, like: Tensor) -> Tensor:
+        """What a function of time has returned for times. NaN is told where values can be read: a body that is nowhere
+        touches nothing."""
+        if like.dim() == 2 and centre.shape[-1] != like.shape[1]:
+            expected = f"[{like.shape[1]}] or [B, {like.shape[1]}]"
+            raise ValueError(f"position must return {expected} at a time, got {list(centre.shape[times.dim() :])}")
+        if is_readable(centre):
+            there = (times >= self.start) & (times < self.end)
+            finite = centre.detach().isfinite().all(-1)
+            if not bool((finite | ~there.reshape(there.shape + (1,) * (finite.dim() - there.dim()))).all()):
+                raise ValueError("position must return finite numbers at a time, got NaN or infinity")
+        return centre
 
     def _mapped(self, times: Tensor) -> Tensor:
         try:
@@ -234,16 +237,6 @@ class RigidMotion(SceneParameters):
     def _elapsed(self, time: float | Tensor, like: Tensor) -> float | Tensor:
         """Time since `start`, [] or [B]."""
         return (time - self.start).to(like.dtype) if isinstance(time, Tensor) else time - self.start
-
-
-def _as_position(value: Any, time: Tensor) -> Tensor:
-    """Position [D] or [B, D] that a function of time returns in another form than a tensor."""
-    if value is None or isinstance(value, str):
-        raise TypeError(f"position must return a tensor, an array or numbers at a time, got {shape_of(value)}")
-    position = as_value("the result of position", value, time)
-    if isinstance(position, Tensor):
-        return position
-    return torch.tensor(position, dtype=torch.float64, device="cpu").to(time.device, non_blocking=True)
 
 
 def to_body(rotation: Tensor | None, arm: Tensor) -> Tensor:

@@ -62,7 +62,8 @@ class Obstacle(RigidMotion):
     Args:
         shape: see `torch_mpm.shapes`.
         position: centre (or a point of the plane) at time `start` [m], [D] or [B, D] in one of the forms below; or a
-            function of the time, a tensor [] or [B], that returns one of them.
+            function of the time, a tensor [], that returns one of them. Scenes with times of their own have the time
+            [B]: a function that does not return [B, D] for it is called with the time [] of each scene.
         kind: "sticky", "slip" or "separate".
         friction: Coulomb coefficient ≥ 0, [] or [B].
         velocity: velocity of the centre [m/s], [D] or [B, D]. Not with a function as position, whose derivative by time

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from .obstacles import Obstacle
 
 REACH = 3.0
-"""How far from free space nodes meet its faces, in dx."""
+"""How far from free space nodes of a step meet its faces, in dx."""
 SEAM = 0.1
 """Half of it, in dx, is the width of gaps and the height of steps that count as closed."""
 MOST_FACES, MOST_COMPILED = 12, 6
@@ -50,6 +50,7 @@ class SolidNodes:
         time: [s], a number or a tensor [] or [B].
         dx: node distance [m]; None for nodes of no lattice, whose seams are a share of their coordinates.
         faces: of the domain.
+        sees: how far from free space nodes meet its faces, in dx.
     """
 
     obstacles: Sequence[Obstacle]
@@ -59,6 +60,7 @@ class SolidNodes:
     time: float | Tensor
     dx: float | None
     faces: Sequence[Face] = ()
+    sees: float = REACH
 
     def __post_init__(self) -> None:
         """Rounding is that of the largest coordinate, of nodes beyond these too."""
@@ -67,7 +69,7 @@ class SolidNodes:
         size = 1e-3 * largest if self.dx is None else torch.full_like(largest, SEAM * self.dx)
         self.seam = torch.maximum(4 * self.rounding, size)
         self.unit = 1e-3 * self.seam
-        self.reach = math.inf if self.dx is None else REACH * self.dx
+        self.reach = math.inf if self.dx is None else self.sees * self.dx
 
     def chosen(self, rows: Tensor) -> SolidNodes:
         """Some of the nodes, int64 [n]."""
@@ -282,7 +284,22 @@ def find_surfaces(solid: SolidNodes) -> Meeting | None:
 
 def moved_to_surface(solid: SolidNodes) -> tuple[Tensor, Tensor]:
     """Positions [N, D] [m], those inside obstacles moved to the nearest point of free space, and which have moved, bool
-    [N]. Without gradient."""
+    [N]. Without gradient.
+
+    Points see faces at any distance. Faces of shapes that are known by their distance alone are found near a point: far
+    ones are looked for where a point is still inside.
+    """
+    far = dataclasses.replace(solid, sees=math.inf)
+    if all(map(_has_faces, solid.obstacles)):
+        solid = far
+    x, moved, inside = _moved_out(solid)
+    if solid is not far and _may_be(inside):
+        x = torch.where(inside[:, None], _moved_out(far)[0], x)
+    return x, moved
+
+
+def _moved_out(solid: SolidNodes) -> tuple[Tensor, Tensor, Tensor]:
+    """`moved_to_surface`, and which points are still inside."""
     x = solid.positions.detach()
     inside = (solid.distances(x) < -solid.rounding).any(1)
     moved = torch.zeros_like(inside)
@@ -300,7 +317,7 @@ def moved_to_surface(solid: SolidNodes) -> tuple[Tensor, Tensor]:
         x, moved = foot, moved | inside
         in_seam = inside & (step != 0).any(1) & ~solid.is_free(x, step)
         inside = (solid.distances(x) < -solid.rounding).any(1) | in_seam
-    return x, moved
+    return x, moved, inside
 
 
 def _is_closed(face: Face) -> bool:

@@ -68,15 +68,7 @@ class Walls:
         self.kind, self.friction = _frozen(kind), _frozen(friction)
         self.lower, self.upper = _numbers("lower", lower), _numbers("upper", upper)
         self._faces: tuple[Any, tuple[Face, ...]] = (None, ())
-        for name in _flat(kind):
-            if name not in WALL_KINDS:
-                raise ValueError(f"kind of a wall must be one of {sorted(WALL_KINDS)}, got {name!r}")
-        for coefficient in _flat(friction):
-            if isinstance(coefficient, Tensor):
-                raise TypeError(
-                    "friction of walls must be a number, got Tensor: use a Plane for friction with a gradient"
-                )
-            check_number("friction of walls", coefficient, "a finite number >= 0", lambda v: 0 <= v < math.inf)
+        _check(self.kind, self.friction)
 
     def __repr__(self) -> str:
         return f"Walls({self.kind!r}, lower={self.lower}, upper={self.upper}, friction={self.friction})"
@@ -90,6 +82,7 @@ class Walls:
         return self._faces[1]
 
     def _resolve(self, grid: _Box) -> tuple[Face, ...]:
+        _check(self.kind, self.friction)  # which may have been assigned
         lower = grid.lower if self.lower is None else self.lower
         upper = grid.upper if self.upper is None else self.upper
         if len(lower) != grid.dim or len(upper) != grid.dim:
@@ -109,6 +102,17 @@ class Walls:
         if "mirror" not in _flat(self.kind):
             return None
         return Walls(_replaced(self.kind, {name: "open" for name in CONTACTS}), self.lower, self.upper)
+
+
+def _check(kind: Any, friction: Any) -> None:
+    """Raise for a kind or a coefficient that no wall can have."""
+    for name in _flat(kind):
+        if name not in WALL_KINDS:
+            raise ValueError(f"kind of a wall must be one of {sorted(WALL_KINDS)}, got {name!r}")
+    for coefficient in _flat(friction):
+        if isinstance(coefficient, Tensor):
+            raise TypeError("friction of walls must be a number, got Tensor: use a Plane for friction with a gradient")
+        check_number("friction of walls", coefficient, "a finite number >= 0", lambda v: 0 <= v < math.inf)
 
 
 def _check_mirrors(grid: _Box, axis: int, faces: Sequence[Face]) -> None:

@@ -14,6 +14,7 @@ import io
 import json
 import math
 import os
+import sys
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -41,7 +42,7 @@ HDF5_SPACE = 2**24
 
 def h5py_module() -> Any:
     host_memory.require_address_space(HDF5_SPACE, "a file in HDF5")
-    return optional.load("h5py", "trajectories", "data")
+    return sys.modules.get("h5py") or optional.load("h5py", "trajectories", "data")
 
 
 class _File:

@@ -21,6 +21,7 @@ from ..boundaries import Obstacle
 from ..errors import NUMBER_OR_TENSOR, check_number, check_real, shape_of
 from ..geometry.per_scene import per_node
 from ..geometry.shapes import with_gradient
+from ..geometry.timed import REFUSALS
 from ..geometry.vectors import unit
 from ..grid.bspline import base_node, bspline
 from ..grid.grid import Blocks
@@ -490,7 +491,20 @@ def _at(value: Timed, time: float | Tensor) -> Number:
     """A number or a tensor, given or returned by a function of the time."""
     if isinstance(value, (float, Tensor)):
         return value
-    value = value(time) if callable(value) else value
+    if not callable(value):
+        return _returned(value)
+    try:
+        return _returned(value(time))
+    except REFUSALS as error:  # as of functions of numbers, where scenes have times of their own
+        if not isinstance(time, Tensor) or time.dim() == 0:
+            raise
+        try:
+            return torch.stack([torch.as_tensor(_returned(value(one))).to(time).reshape(()) for one in time.unbind()])
+        except REFUSALS:
+            raise error from None
+
+
+def _returned(value: Any) -> Number:
     return value if isinstance(value, Tensor) else float(check_real(FROM_TIME, value, NUMBER_OR_TENSOR))
 
 

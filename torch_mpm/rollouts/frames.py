@@ -12,7 +12,7 @@ from ..errors import check_count, shape_of
 from ..state.state import State, check_state
 from ..step.step import Step
 from .checkpoints import Checkpoints
-from .hooks import Hook, Parts
+from .hooks import Hook, Parts, Reader
 from .plan import RolloutPlan
 from .run import rollout
 
@@ -56,7 +56,8 @@ def frames(
             of the step; None leaves the state unchanged. For an intermediate loss it may read the state, and gradients
             pass.
 
-    Differentiable as `rollout`. The steps between two frames are one call of an op where `rollout` can do so.
+    Differentiable as `rollout`. The steps between two frames are one call of an op where `rollout` can do so. Without a
+    hook all n steps are one control step, see `Obstacle`.
 
     Raises:
         TypeError, ValueError: as `rollout`; for a field that the state lacks, or another result of the hook.
@@ -76,11 +77,12 @@ def frames(
             # A hook may write into the tensors of the state.
             values.append(value if value.requires_grad or hook is None else value.clone())
 
-    def seen(state: State, k: int) -> State | None:
+    def acted(state: State, k: int) -> State | None:
         keep(state)
         return None if hook is None else hook(state, k)
 
     Parts(n, hook=hook)  # `rollout` refuses a hook that is not callable.
+    seen = Reader(lambda state, k: keep(state)) if hook is None else acted
     options: dict[str, Any] = {"prefix": prefix, "truncate": truncate, "graph": graph}
     options |= {"schedule": schedule, "plan": plan}
     end = rollout(step, state, n, dt, checkpoint, hook=seen, every=every, **options)

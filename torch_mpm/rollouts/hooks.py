@@ -20,6 +20,16 @@ Hook = Callable[[State, int], "State | None"]
 """Called with a state and the number of steps before it; may return another state to continue from."""
 
 
+@dataclasses.dataclass(frozen=True)
+class Reader:
+    """A hook that only reads states, so that no control step ends at its calls."""
+
+    read: Callable[[State, int], None]
+
+    def __call__(self, state: State, k: int) -> None:
+        self.read(state, k)
+
+
 @dataclasses.dataclass
 class Parts:
     """Actions between the n steps of a rollout; see `rollout` for the arguments.
@@ -73,7 +83,8 @@ class Parts:
         if self.norms is not None:
             self.norms.start(sorted(measured), *scales)
         stops = sorted({0, prefix, self.n} | cuts | hooked | measured)
-        began, control_steps = state, _ControlSteps(control, sorted({0, self.n} | hooked))
+        ends = set() if isinstance(self.hook, Reader) else hooked
+        began, control_steps = state, _ControlSteps(control, sorted({0, self.n} | ends))
         with control_steps:
             for k, following in zip(stops, [*stops[1:], self.n], strict=True):
                 mode = torch.no_grad if k < prefix else contextlib.nullcontext

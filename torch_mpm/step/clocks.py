@@ -6,6 +6,7 @@ import itertools
 from bisect import bisect_left
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -29,7 +30,10 @@ def clocks(state: State, dt: float | Tensor, scenes: int) -> tuple[float, Tensor
 
 def time_after(time: float | Tensor, dt: float | Tensor, n: int = 1) -> float | Tensor:
     """Time n steps later, in float64 and rounded as in single steps."""
-    dt = dt.double() if isinstance(dt, Tensor) else dt
+    if isinstance(dt, Tensor):
+        dt = dt.double()
+    elif isinstance(dt, np.generic):  # whose sum with a number may be in float32
+        dt = float(dt)
     for _ in range(n):
         time = time + dt
     return time

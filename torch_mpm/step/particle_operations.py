@@ -21,6 +21,7 @@ from torch import Tensor, nn
 
 from ..cuda_graphs.capture import DeviceConstantCache
 from ..errors import check_number, check_vector, shape_of
+from ..geometry.timed import REFUSALS
 from ..laws.parameters import TensorModule
 from ..ops.arguments import per_particle
 from ..state.state import State
@@ -48,6 +49,7 @@ class Timed(TensorModule):
         for name, value in (("start", start), ("end", end)):
             if not isinstance(value, Tensor):
                 check_number(name, value, "a number", lambda v: v == v, "a number or a tensor")
+            _refuse_grad(name, value)
         if particles is not None and (not isinstance(particles, Tensor) or particles.dtype != torch.bool):
             found = particles.dtype if isinstance(particles, Tensor) else shape_of(particles)
             raise TypeError(f"particles must be bool [P], got {found}")
@@ -64,6 +66,8 @@ class Timed(TensorModule):
         time = state.time
         if isinstance(time, Tensor) and time.numel() > 1:
             time = per_particle(time, state.scene, len(state))
+        for name in ("start", "end"):
+            _refuse_grad(name, getattr(self, name))
         start, end = (of_particles(name, getattr(self, name), state, (len(state),)) for name in ("start", "end"))
         if any(isinstance(t, Tensor) for t in (time, start, end)):
             return (time >= start) & (time < end)
@@ -187,6 +191,12 @@ def of_particles(name: str, value: Any, state: State, shape: tuple[int, ...]) ->
     return value
 
 
+def _refuse_grad(name: str, value: Any) -> None:
+    """Raise for a tensor by which particles are selected, and whose gradient would be lost."""
+    if isinstance(value, Tensor) and value.requires_grad:
+        raise ValueError(f"{name} must not require grad: which particles are affected is not differentiable")
+
+
 def _checked_vector(name: str, value: Any) -> Any:
     return value if isinstance(value, Tensor) or callable(value) else check_vector(name, value)
 
@@ -198,15 +208,56 @@ class _Numbers:
         self._kept = DeviceConstantCache()
 
     def at(self, name: str, value: Any, state: State) -> Tensor:
-        """[D] or [P, D]"""
+        """[D] or [P, D], in the order of the state."""
+        if not callable(value):
+            return self._given(name, value, state)
+        time = time_like(state.time, state.x)
+        if isinstance(time, Tensor) and time.numel() > 1:
+            return self._at_times(name, value, time, state)
+        return self._given(name, value(time.reshape(()) if isinstance(time, Tensor) else time), state)
+
+    def _given(self, name: str, value: Any, state: State) -> Tensor:
         x = state.x
-        if callable(value):
-            value = value(time_like(state.time, state.x))
         if not isinstance(value, Tensor):
             numbers = check_vector(name, value, x.shape[1])
             key = (numbers, x.dtype, x.device)
             return self._kept.get(key, lambda: torch.tensor(numbers, dtype=x.dtype, device=x.device), x)
         return of_particles(name, value, state, tuple(x.shape)).to(x.dtype)
+
+    def _at_times(self, name: str, function: Callable[[Any], Any], time: Tensor, state: State) -> Tensor:
+        """The value of a function where scenes have times of their own [B].
+
+        A function that does not return [P, D] for these, since it is written for one time, is called with the time of
+        each scene. So is one for as many scenes as dimensions, where a product with the times has this shape too.
+        """
+        whole = getattr(state, "particles", len(state)), state.x.shape[1]
+        value, problem = None, None
+        try:
+            value = function(time)
+        except torch.OutOfMemoryError:
+            raise
+        except REFUSALS as error:
+            problem = error
+        if isinstance(value, Tensor) and tuple(value.shape) == whole and len(time) != whole[1]:
+            return self._given(name, value, state)
+        try:
+            rows = [self._given(name, function(one), state) for one in time.unbind()]
+        except REFUSALS as error:
+            if problem is not None:
+                raise error from problem
+            return self._given(name, value, state)  # of a function of times [B] alone
+        if all(row.dim() == 1 for row in rows):
+            return per_particle(torch.stack(rows), state.scene, len(state))
+        return _of_own_scene([row.expand_as(state.x) for row in rows], state)
+
+
+def _of_own_scene(values: Sequence[Tensor], state: State) -> Tensor:
+    """Values of all particles [P, D] for each scene, as those for the scene of each particle."""
+    assert state.scene is not None
+    result = values[0]
+    for scene, value in enumerate(values[1:], 1):
+        result = torch.where(state.scene.eq(scene)[:, None], value, result)
+    return result
 
 
 def _with_velocity(state: State, v: Tensor, acting: bool | Tensor) -> State:

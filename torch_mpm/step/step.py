@@ -18,6 +18,7 @@ from ..boundaries.impulses import Impulses, check_impulse, impulses_of, no_impul
 from ..boundaries.thickness import warn_of_thin_walls
 from ..cuda_graphs.capture import DeviceConstantCache, is_captured, is_traced, is_transformed
 from ..errors import REAL, PrecisionWarning, check_flag, check_number, is_finite, shape_of
+from ..geometry.per_scene import WRITABLE
 from ..geometry.values import Value, constant, filled, shape_of_value
 from ..grid import resolution
 from ..grid.grid import Blocks, Grid, check_grid
@@ -390,6 +391,8 @@ class Step(TensorModule):
         gravity = self.gravity
         if gravity is None:
             return None
+        if isinstance(gravity, WRITABLE):  # which may have been written to
+            gravity = _checked_gravity(gravity, self.grid)
         if isinstance(gravity, Tensor):
             gravity = gravity.to(x.dtype)
             return gravity.squeeze(0) if len(gravity) == 1 and gravity.dim() == 2 else gravity
@@ -403,9 +406,10 @@ class Step(TensorModule):
         """A state whose particles inside obstacles are moved to the nearest point of free space, and how many of each
         scene were.
 
-        Particles may be found inside after seeding, or where an obstacle appears. They are pushed out slowly, with
-        stress, or not at all where they are deep; a particle that was moved keeps all else that it has. Obstacles are
-        where they are at `state.time`; those on which hooks or an `apply` of their own act are left alone. Without
+        One that is deeper than 3 dx inside several obstacles may be moved to a point of free space that is not the
+        nearest. Particles may be found inside after seeding, or where an obstacle appears. They are pushed out slowly,
+        with stress, or not at all where they are deep; a particle that was moved keeps all else that it has. Obstacles
+        are where they are at `state.time`; those on which hooks or an `apply` of their own act are left alone. Without
         gradient; nothing here synchronises with a GPU.
 
         Returns:
@@ -634,7 +638,8 @@ def _argument(step: Step, name: str, value: Any) -> Any:
     if name == "flip":
         return float(check_number("flip", value, "between 0 and 1", lambda v: 0 <= v <= 1))
     if name == "gravity" and value is not None:
-        return _checked_gravity(value, step.grid)
+        gravity = _checked_gravity(value, step.grid)
+        return value if isinstance(value, WRITABLE) else gravity
     if name == "walls" and value is not None and not isinstance(value, Walls):
         if not isinstance(value, str):
             raise TypeError(f"walls must be the name of a kind, Walls or None, got {shape_of(value)}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Sequence
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -55,6 +56,15 @@ class SDF(Shape):
             )
 
 
+def _checked_samples(name: str, values: Any) -> Tensor:
+    """Samples that are given or assigned."""
+    if not isinstance(values, Tensor) or values.dim() not in (2, 3) or min(values.shape) < 2:
+        raise ValueError(f"{name} must be a tensor [X, Y] or [X, Y, Z] of 2 or more each, got {shape_of(values)}")
+    if values.requires_grad:
+        raise ValueError(f"{name} must not require grad: which nodes are inside is not differentiable")
+    return values
+
+
 class Sampled(Shape):
     """Shape given by its signed distance at the nodes of a lattice, multilinear between them.
 
@@ -75,14 +85,12 @@ class Sampled(Shape):
     name = "sampled"
     arguments = ("values", "lower", "spacing")
     number = 5
+    CHECKS: ClassVar = {"values": _checked_samples}
 
     def __init__(self, values: Tensor, lower: Sequence[float], spacing: float) -> None:
-        if not isinstance(values, Tensor) or values.dim() not in (2, 3) or min(values.shape) < 2:
-            raise ValueError(f"values must be a tensor [X, Y] or [X, Y, Z] of 2 or more each, got {shape_of(values)}")
+        _checked_samples("values", values)
         self.lower = check_vector("lower", lower, values.dim())
         self.spacing = float(check_number("spacing", spacing, "positive", lambda v: 0 < v < math.inf))
-        if values.requires_grad:
-            raise ValueError("values must not require grad: which nodes are inside is not differentiable")
         values = values.to("cpu", torch.float64)
         if not bool(values.isfinite().all()):
             raise ValueError("values must be finite")
