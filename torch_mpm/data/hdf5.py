@@ -14,8 +14,8 @@ import io
 import json
 import math
 import os
-import sys
 import struct
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
