@@ -28,7 +28,8 @@ def read(path: Path) -> tuple[Array, Array]:
     text = re.sub(rb"\\(\r\n|\r|\n)", b" ", text) if b"\\" in text else text
     vertices, corners, number, line = array("d"), array("q"), 0, b""
     try:
-        for number, line in enumerate(text.splitlines(), 1):
+        for line in text.splitlines():
+            number += 1
             words = line.split()
             if words and words[0] == b"v":
                 x, y, z = words[1:4]
@@ -53,4 +54,3 @@ def _index(word: bytes, count: int) -> int:
     if index == 0 or index < -count:
         raise ValueError(f"there is no vertex {index}")
     return index - 1 if index > 0 else count + index
-
