@@ -1,5 +1,7 @@
 """Files of points as other programs write them: separators, names of columns, comments, PLY; and what is refused."""
 
+import warnings
+
 import numpy as np
 import pytest
 import torch
@@ -164,6 +166,79 @@ def ply(path, form, real="double", volume=True, cut=0):
         body = ("\n".join(" ".join(str(a) for a in row) for row in rows.tolist()) + "\n3 0 1 2\n").encode()
     path.write_bytes(head + (body[:-cut] if cut else body))
     return path
+
+
+@pytest.mark.parametrize("mark", ["# ", "#", "% ", "// ", "# columns: ", "# Columns: x y\n# "])
+@pytest.mark.parametrize("names", ["z y x", "y x z", "x vx y vy", "id z x y", "x y z mass", "volume z y x"])
+def test_names_in_a_comment_in_any_order(names, mark, tmp_path):
+    columns = names.split()
+    path = tmp_path / "points.txt"
+    path.write_text(
+        f"{mark}{names}\n" + "".join(" ".join(str(10 * r + k) for k in range(len(columns))) + "\n" for r in (1, 2))
+    )
+    found = point_files.read(path)
+    axes = [columns.index(axis) for axis in "xyz" if axis in columns]
+    np.testing.assert_array_equal(found.x, [[10 * r + k for k in axes] for r in (1, 2)])
+    assert (found.volume is None) == ("volume" not in columns)
+    assert found.volume is None or found.volume.tolist() == [10.0, 20.0]
+
+
+@pytest.mark.parametrize("rows", [3, 4])
+def test_prose_in_a_comment_names_no_columns(rows, tmp_path):
+    path = tmp_path / "points.txt"
+    path.write_text(f"# y over x{' here' * (rows - 3)}\n" + " ".join(map(str, range(rows))) + "\n")
+    assert point_files.read(path).x.tolist() == [[0.0, 1.0, 2.0]]
+
+
+@pytest.mark.parametrize("head", ["x,y,z\n", "x,y,z,\n", ""])
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "latin-1"])
+def test_encodings_and_separators_at_the_ends_of_lines(head, encoding, tmp_path):
+    path = tmp_path / "points.csv"
+    path.write_bytes(f"# Höhe [m³]\n{head}0,1,2,\n3,4,5,\n".encode(encoding))
+    assert point_files.read(path).x.tolist() == [[0.0, 1.0, 2.0], [3.0, 4.0, 5.0]]
+
+
+def test_texts_in_other_columns(tmp_path):
+    path = tmp_path / "points.csv"
+    path.write_text('name,x,y,z,fixed\n"a, b",0,1,2,True\n"c",3,4,5,False\n')
+    assert point_files.read(path).x.tolist() == [[0.0, 1.0, 2.0], [3.0, 4.0, 5.0]]
+
+
+@pytest.mark.parametrize("head", ["x,y,z\n", ""])
+@pytest.mark.parametrize(("row", "count"), [("3,4", 2), ("3,4,5,6", 4), ("3,,4,5", 4), ('"3",4,5,6', 4), ("7", 1)])
+def test_a_row_of_another_length(head, row, count, tmp_path):
+    """A decimal comma would shift the columns that follow it."""
+    path = tmp_path / "points.csv"
+    path.write_text(f"{head}0,1,2\n\n# a comment\n{row}\n")
+    line = head.count("\n") + 4
+    with pytest.raises(ValueError, match=f"line {line} has {count} columns, and the first row of numbers has 3"):
+        point_files.read(path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"0 1 2": "0 1 2 9"}, "number of columns changed|its rows have 4 numbers"),
+        ({"0 1 2": "0 1 2 9", "3 4 5": "3 4 5 9"}, "its rows have 4 numbers, not 3"),
+        ({"0 1 2\n": "0 1 2 "}, "its rows have 6 numbers, not 3"),
+        ({"format ascii 1.0\n": ""}, "its header has no line with the format"),
+        ({"comment": "comment Höhe", "0 1 2": "\n0 1 2\n"}, ""),
+    ],
+)
+def test_rows_of_text_in_a_ply(changes, message, tmp_path):
+    text = "ply\nformat ascii 1.0\ncomment\nelement vertex 2\n"
+    text += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n0 1 2\n3 4 5\n"
+    for old, new in changes.items():
+        text = text.replace(old, new)
+    path = tmp_path / "points.ply"
+    path.write_text(text, encoding="utf-8")
+    if message:
+        with pytest.raises(ValueError, match=message):
+            point_files.read(path)
+    else:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            assert point_files.read(path).x.tolist() == [[0.0, 1.0, 2.0], [3.0, 4.0, 5.0]]
 
 
 @pytest.mark.parametrize("form", FORMS)

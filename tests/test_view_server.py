@@ -1,9 +1,11 @@
 """The server of the viewer refuses addresses that it cannot listen at, and pages of other sites."""
 
+from urllib.parse import urlsplit
+
 import pytest
 
 from torch_mpm.cli import main
-from torch_mpm.render.viewer_server import is_own_page, viser_server
+from torch_mpm.render.viewer_server import is_own_page, page_address, viser_server
 
 
 @pytest.mark.parametrize(
@@ -17,6 +19,7 @@ from torch_mpm.render.viewer_server import is_own_page, viser_server
         ("http://127.0.0.1:9000", "127.0.0.1:8080", "127.0.0.1", False),  # another server of this machine
         ("http://evil.example:8080", "evil.example:8080", "127.0.0.1", False),  # a name that leads here
         ("null", "127.0.0.1:8080", "127.0.0.1", False),
+        ("http://[", "127.0.0.1:8080", "127.0.0.1", False),
         ("file://", "127.0.0.1:8080", "127.0.0.1", False),
         ("http://machine.example:8080", "machine.example:8080", "0.0.0.0", True),
         ("http://evil.example", "machine.example:8080", "0.0.0.0", False),
@@ -24,6 +27,12 @@ from torch_mpm.render.viewer_server import is_own_page, viser_server
 )
 def test_pages_of_the_server(origin, requested, host, own):
     assert is_own_page(origin, requested, host) == own
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "::1", "fe80::1%eth0"])
+def test_the_address_of_the_page(host):
+    page = urlsplit(page_address(host, 8080))
+    assert page.hostname == host and page.port == 8080
 
 
 def test_pages_of_other_sites_cannot_connect():

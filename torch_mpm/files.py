@@ -68,7 +68,7 @@ def read_text(path: str | Path, kind: str) -> str:
         UnicodeDecodeError: for a file that is not UTF-8.
     """
     check_file(path, kind, LARGEST_TEXT)
-    return Path(path).read_text(encoding="utf-8")
+    return Path(path).read_text(encoding="utf-8-sig")  # Editors of Windows write a byte order mark.
 
 
 def _raised_limit() -> int:

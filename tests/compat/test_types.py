@@ -125,3 +125,34 @@ def test_numbers_of_laws_and_solvers(value):
     ):
         with pytest.raises((TypeError, ValueError), match=rf"^{name} must "):
             make()
+
+
+@pytest.mark.parametrize(
+    "name", [name for name in table.RANGES if name not in ("nu", "friction_angle", "rpic_damping")]
+)
+def test_numbers_beyond_the_type_of_the_particles(name):
+    with pytest.raises(
+        ValueError, match=rf"{name} must be at most 3.4e\+38, the largest number of torch.float32, got 1e"
+    ):
+        simulator().set_parameters_dict({name: 1e300})
+
+
+@pytest.mark.parametrize("size", [[-0.1, 0.1, 0.1], [0.1, 0.1, -1e-9]])
+@pytest.mark.parametrize("of", ["box", "impulse", "translation", "mpm_pytorch impulse", "mpm_pytorch translation"])
+def test_boxes_of_negative_size(of, size):
+    """They would select no particle."""
+    made, solver = simulator(), mpm_pytorch.MPMSolver(0.4 + 0.2 * torch.rand(10, 3))
+    made.set_parameters_dict({"E": 1e4, "nu": 0.3, "density": 100.0})
+    box = {"point": [0.5] * 3, "size": size, "E": 1e5, "nu": 0.3, "density": 100.0}
+    place = {"point": [0.5] * 3, "size": size}
+    moving = {**place, "velocity": [0.0] * 3, "start_time": 0.0, "end_time": 1.0}
+    up = [0.0, 0.0, 1.0]
+    calls = {
+        "box": lambda: made.set_parameters_dict({"additional_material_params": [box]}),
+        "impulse": lambda: made.add_impulse_on_particles(up, 1e-3, **place),
+        "translation": lambda: made.enforce_particle_velocity_translation(**moving),
+        "mpm_pytorch impulse": lambda: boundary_condition.add_impulse_on_particles(solver, up, 1e-3, **place),
+        "mpm_pytorch translation": lambda: boundary_condition.enforce_particle_velocity_translation(solver, **moving),
+    }
+    with pytest.raises(ValueError, match="size must not be negative"):
+        calls[of]()

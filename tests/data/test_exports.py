@@ -504,7 +504,12 @@ def test_metadata_serves_every_reader(flat, tmp_path, export):
     assert words["bounds"] == [[0.0, 1.0], [0.0, 2.0]] and words["dt"] == 0.0025
 
 
-@pytest.mark.parametrize("export", [*ALL, lambda source, out: data.export_tfrecord(source, out, context=True)])
+OF_SCENES = [data.export_scenes_vtk, data.export_scenes_ply]
+
+
+@pytest.mark.parametrize(
+    "export", [*ALL, *OF_SCENES, lambda source, out: data.export_tfrecord(source, out, context=True)]
+)
 def test_a_data_set_without_a_valid_scene(tmp_path, export):
     source = datasets.make_dataset(tmp_path / "set", shards=0)
     with pytest.raises(ValueError, match="has no valid scene yet"):

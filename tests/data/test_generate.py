@@ -28,6 +28,7 @@ from torch_mpm.data.sampling import content
 from torch_mpm.data.shard import record_path, shard_path
 from torch_mpm.data.shard_simulation import draw, simulate
 from torch_mpm.data.workers import Worker, WorkerError, take_device, worker
+from torch_mpm.errors import DamagedFileError
 from torch_mpm.scene import SceneError
 from torch_mpm.scene.folder import OutputError
 
@@ -214,9 +215,87 @@ def test_a_corrupt_shard_is_found_and_made_anew(whole, copy, name, damage):
 def test_a_shard_of_another_number_is_found_and_made_anew(whole, copy):
     for place in (shard_path, lambda folder, index: record_path(shard_path(folder, index))):
         shutil.copy(place(copy, 1), place(copy, 0))
-    assert "has the scenes [2, 3], not 0 to 1" in next(verify(copy))
+    assert "has other scenes than those of its number" in next(verify(copy))
     assert generate(configuration(), copy, device="cpu", check=True)["scenes"] == 2
     assert_same(whole, copy)
+
+
+@pytest.fixture(scope="module")
+def other(tmp_path_factory):
+    """A data set of another seed, otherwise equal."""
+    target = tmp_path_factory.mktemp("other") / "set"
+    assert generate(configuration(dataset__seed=9), target, device="cpu")["failed"] == 0
+    finalize(target)
+    return target
+
+
+@pytest.mark.parametrize("read", [finalize, DatasetFolder, lambda folder: verify_one(folder)])
+def test_a_shard_of_another_data_set_is_refused(other, copy, read):
+    """With its record, and of the same number, scenes and fields."""
+    for place in (shard_path, lambda folder, index: record_path(shard_path(folder, index))):
+        shutil.copy(place(other, 1), place(copy, 1))
+    with pytest.raises(DamagedFileError, match=r"shard_00001\.json: is of another data set \(\w{12}, this is \w{12}\)"):
+        read(copy)
+
+
+def verify_one(folder):
+    problems = list(verify(folder))
+    assert len(problems) == 1
+    raise DamagedFileError(folder, problems[0])
+
+
+def test_a_shard_of_another_data_set_is_made_anew(whole, other, copy):
+    for place in (shard_path, lambda folder, index: record_path(shard_path(folder, index))):
+        shutil.copy(place(other, 1), place(copy, 1))
+    assert generate(configuration(), copy, device="cpu", check=True)["scenes"] == 2
+    assert_same(whole, copy)
+
+
+def test_the_record_of_another_data_set_is_refused(other, copy):
+    shutil.copy(other / "dataset.json", copy / "dataset.json")
+    assert all("is of another data set" in problem for problem in verify(copy))
+    with pytest.raises(DamagedFileError, match="is of another data set"):
+        DatasetFolder(copy)
+
+
+def test_shards_without_a_configuration_are_read(whole, copy):
+    """Those of earlier versions."""
+    datasets.forge(record_path(shard_path(copy, 1)), lambda words: words.pop("configuration"))
+    assert list(verify(copy)) == []
+    assert len(DatasetFolder(copy).scenes()) == len(DatasetFolder(whole).scenes())
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda path, other: path.write_text("{"), "is no metadata of a data set"),
+        (lambda path, other: path.write_text("[1]"), "is no metadata of a data set"),
+        (lambda path, other: path.write_bytes(b"\xff\xfe"), "is no metadata of a data set"),
+        (lambda path, other: path.write_bytes(b""), "is no metadata of a data set"),
+        (lambda path, other: path.write_text(path.read_text().replace("vel_std", "vel_sdt")), "checksum is wrong"),
+        (lambda path, other: path.write_text(path.read_text().replace("0.005", "0.006")), "checksum is wrong"),
+        (lambda path, other: shutil.copy(other / path.name, path), "is of another data set"),
+        (lambda path, other: (path.unlink(), path.symlink_to(other / path.name)), "is a link to a place outside"),
+        (lambda path, other: (path.unlink(), path.mkdir()), "is a folder"),
+        (lambda path, other: (path.unlink(), os.mkfifo(path)), "is a pipe"),
+    ],
+)
+def test_changed_metadata_is_reported(other, copy, change, message):
+    finalize(copy)
+    path = copy / "metadata.json"
+    assert list(verify(copy)) == []
+    change(path, other)
+    (problem,) = verify(copy)
+    assert message in problem and str(path) in problem
+
+
+def test_metadata_of_earlier_versions_or_none(copy):
+    finalize(copy)
+    words = json.loads((copy / "metadata.json").read_text())
+    (copy / "metadata.json").write_text(json.dumps({k: v for k, v in words.items() if k != "checksum"}))
+    assert list(verify(copy)) == []
+    (copy / "metadata.json").unlink()
+    assert list(verify(copy)) == []
 
 
 def test_a_full_disk_keeps_what_is_finished(whole, tmp_path):

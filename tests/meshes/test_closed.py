@@ -42,7 +42,7 @@ def flat(jitter=0.0):
 
 
 @pytest.mark.parametrize(
-    "form", ["{v}", "{v}/{t}", "{v}//{n}", "{v}/{t}/{n}", "flat.glb", "flat.stl", "flat.ply", "flat.off"]
+    "form", ["{v}", "{v}/{t}", "{v}//{n}", "{v}/{t}/{n}", "flat.glb", "flat.obj", "flat.stl", "flat.ply", "flat.off"]
 )
 def test_closed_cubes_of_all_files(form, tmp_path):
     """None of them is a hint that something is wrong, so that nothing warns."""
@@ -55,8 +55,71 @@ def test_closed_cubes_of_all_files(form, tmp_path):
     assert cube.volume(3) == pytest.approx(8 * SIDE**3, rel=1e-6)
     x = 0.9 * (2 * torch.rand(500, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) - 1)
     assert torch.equal(cube.contains(x), (x.abs() < SIDE).all(1))
-    if form.endswith("{n}") or form == "flat.glb":
+    if form in ("flat.glb", "flat.obj"):
         assert re.fullmatch(r"\d+ vertices at positions of others were merged", cube.changes[0])
+
+
+def two_cubes(corner):
+    """Two cubes, the second of half the size, as two objects; `corner` of the index of a vertex and their number."""
+    blocks = []
+    for k, shift in enumerate((0.0, 1.0)):
+        blocks += [f"o part{k}", *("v {:.9g} {:.9g} {:.9g}".format(*(v / (k + 1) + shift)) for v in CORNERS)]
+        count = 8 * (k + 1)
+        blocks += ["f " + " ".join(corner(8 * k + v + 1, count) for v in quad) for quad in QUADS]
+    return "\n".join(blocks) + "\n"
+
+
+OBJ_FORMS = {
+    "positive": lambda text: text,
+    "tabs": lambda text: text.replace(" ", "\t"),
+    "indented": lambda text: "  " + text.replace("\n", " \n\t"),
+    "remarks": lambda text: text.replace("\n", " # a vertex v 0 0 0\n"),
+    "CR": lambda text: text.replace("\n", "\r"),
+    "CRLF": lambda text: text.replace("\n", "\r\n"),
+    "continued": lambda text: text.replace(" ", " \\\n"),
+    "unused": lambda text: text + "v nan 1e30 0\nl 1 2\np 3\n",
+    "last": lambda text: "".join(sorted(text.splitlines(True), key=lambda line: line[0])),  # Faces before vertices.
+}
+
+
+@pytest.mark.parametrize("index", ["positive", "negative", "negative/", "mixed"])
+@pytest.mark.parametrize("form", OBJ_FORMS)
+def test_indices_of_several_objects(form, index, tmp_path):
+    """Negative indices count back from the latest vertex, not from the last one of the file."""
+    if form == "last" and index != "positive":
+        pytest.skip("negative indices stand below their vertices")
+    corners = {
+        "positive": lambda v, count: f"{v}",
+        "negative": lambda v, count: f"{v - 1 - count}",
+        "negative/": lambda v, count: f"{v - 1 - count}/-1/-1",
+        "mixed": lambda v, count: f"{v if v % 2 else v - 1 - count}",
+    }
+    path = tmp_path / "two.obj"
+    path.write_bytes(OBJ_FORMS[form](two_cubes(corners[index])).encode())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        body = shapes.Mesh(path)
+    assert body.volume(3) == pytest.approx(SIDE**3 * (1 + 1 / 8), rel=1e-6)
+    x = torch.tensor([[0.15, 0.15, 0.15], [1.05, 1.05, 1.05], [1.15, 1.05, 1.05], [0.5, 0.5, 0.5]])
+    assert body.contains(x.double()).tolist() == [True, True, False, False]
+
+
+@pytest.mark.parametrize(
+    "line, message",
+    [
+        ("f 0 1 2", "line 1 is not a vertex or a face: 'f 0 1 2', there is no vertex 0"),
+        ("f -1 -2 -3", "there is no vertex -1"),
+        ("v 1,5 2 3", "line 1 .*could not convert"),
+        ("v 1 2", "line 1 .*not enough values"),
+        ("f 1 2 x", "line 1 .*invalid literal"),
+        ("f 1 2 17", "a face has the vertex 17, and there are 16"),
+    ],
+)
+def test_lines_of_objects_that_are_refused(line, message, tmp_path):
+    path = tmp_path / "two.obj"
+    path.write_text(line + "\n" + two_cubes(lambda v, count: f"{v}"))
+    with pytest.raises(ValueError, match=message):
+        shapes.Mesh(path)
 
 
 def test_vertices_that_are_near_are_merged_and_reported():

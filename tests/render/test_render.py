@@ -505,3 +505,14 @@ def test_labels_are_inside_the_pictures_of_a_batch(scenes):
     for text in texts:
         box = text.get_window_extent()
         assert box.x0 >= 0 and box.y0 >= 0 and box.x1 <= image.shape[1] and box.y1 <= image.shape[0], text
+
+
+@pytest.mark.parametrize("origin", [None, (500000.0, 4e6)])
+@pytest.mark.parametrize("resolution", [(16, 16), (64, 64), (16, 400), (400, 16), (100, 64)])
+def test_pictures_without_room_for_their_text(resolution, origin):
+    """The axes keep a share of the picture, so that particles are drawn."""
+    renderer = render.Renderer(((0.0, 0.0), (1.0, 1.0)), resolution, "speed", (0.0, 1.0), origin=origin)
+    image = renderer.frame(torch.rand(10, 2), torch.rand(10, 2), time=1.0, title="one")
+    assert image.shape == (resolution[1], resolution[0], 3)
+    box = renderer.scene.axes.get_position()
+    assert box.width > 0 and box.height > 0 and 0 <= box.x0 < 0.95 and 0 <= box.y0 < 0.95

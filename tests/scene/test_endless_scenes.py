@@ -12,6 +12,8 @@ from torch_mpm.cli import main
 from torch_mpm.scene import Scene, SceneError
 from torch_mpm.scene import run as module
 
+EMITTER = "emitter=[{material='jelly', center=[0.5, 0.8], radius=0.05, "
+
 
 @pytest.mark.parametrize("command", ["check", "run"])
 @pytest.mark.parametrize(
@@ -23,6 +25,9 @@ from torch_mpm.scene import run as module
         ("material.jelly.E=1e30", "cfl"),
         ("grid.dx=1e-9", ""),
         ("fps=1e300", "duration"),
+        (f"{EMITTER}velocity=[0.0, -1e9], rate=1e-3}}]", "cfl"),
+        (f"{EMITTER}velocity=[0.0, -1e30], rate=1e-3}}]", "cfl"),
+        ("dt=10.0", "dt"),
     ],
 )
 def test_scenes_that_would_never_end(tmp_path, capsys, command, override, key):
@@ -36,6 +41,19 @@ def test_the_number_of_substeps_is_told(tmp_path, capsys):
     scene.write_text(FILE.format(duration=0.04))
     assert main(["check", str(scene), "--set", "dt=1e-5"]) == 0
     assert "about 4000 substeps" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("start", "share"), [(0.0, 1.0), (0.02, 0.5)])
+def test_the_speed_of_emitters_counts(start, share, tmp_path, capsys):
+    """Compared with the substeps that a run takes, of which there are few without the emitter."""
+    scene = tmp_path / "scene.toml"
+    scene.write_text(FILE.format(duration=0.04))
+    emitter = f"{EMITTER}velocity=[0.0, -500.0], start={start}}}]"
+    assert main(["check", str(scene), "--set", emitter]) == 0
+    told = int(re.search(r"about (\d+) substeps", capsys.readouterr().out)[1])
+    assert main(["run", str(scene), "--set", emitter, "-o", str(tmp_path / "out"), "--quiet"]) == 0
+    taken = int(re.search(r"(\d+) substeps", capsys.readouterr().out)[1])
+    assert told <= taken <= 2 * told and told > 1000 * share
 
 
 @pytest.mark.parametrize("quiet", [False, True])

@@ -1,6 +1,7 @@
 """Folders of runs: full disks, damaged and forged files, two processes in one folder, outputs that cannot be."""
 
 import json
+import os
 import resource
 import shutil
 import signal
@@ -292,3 +293,30 @@ def test_pictures_that_a_trajectory_cannot_give(scene, unfinished, capsys):
     assert "render.color_by: the trajectory has no 'stress'" in errors
     errors = printed(capsys, "render", unfinished, "--set", "render={resolution=[0, 5]}")
     assert "run.json: render.resolution: takes a width and a height of 16 to 16384 pixels, got (0, 5)" in errors
+
+
+FINISHED = {
+    **{
+        name: lambda path, damage=damage: path.write_bytes(damage(path.read_bytes())) for name, damage in DAMAGE.items()
+    },
+    "a pipe": lambda path: (path.unlink(), os.mkfifo(path)),
+    "a folder": lambda path: (path.unlink(), path.mkdir()),
+    "a broken link": lambda path: (path.unlink(), path.symlink_to(path.parent / "none.h5")),
+}
+
+
+@pytest.mark.parametrize("damage", FINISHED)
+def test_a_finished_run_with_a_damaged_trajectory_is_not_reported_as_complete(damage, unfinished, scene, capsys):
+    resume = ["run", str(scene), "-o", str(unfinished), "--resume", "--quiet"]
+    assert main(resume) == 0 and main(resume) == 0
+    assert "holds the complete run of this scene" in capsys.readouterr().out
+    FINISHED[damage](unfinished / "trajectory.h5")
+    assert "trajectory.h5" in told(capsys, *resume)
+
+
+def test_the_trajectory_of_another_finished_run(unfinished, scene, tmp_path, capsys):
+    resume = ["run", str(scene), "-o", str(unfinished), "--resume", "--quiet"]
+    other = ["run", str(scene), "-o", str(tmp_path / "other"), "--quiet", "--set", "gravity=[0.0, -5.0]"]
+    assert main(resume) == 0 and main(other) == 0
+    shutil.copy(tmp_path / "other" / "trajectory.h5", unfinished / "trajectory.h5")
+    assert "is not the trajectory of the run in run.json" in told(capsys, *resume)

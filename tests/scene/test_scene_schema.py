@@ -14,7 +14,9 @@ from helpers import FILE, disc
 pytest.importorskip("pydantic")
 
 import torch_mpm as mpm
-from torch_mpm.scene import Scene, SceneError, json_schema
+from torch_mpm.data.configuration import Dataset
+from torch_mpm.scene import Scene, SceneError, json_schema, schema
+from torch_mpm.scene.explain import BOOLEANS
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.toml"))
 BOX = {"shape": "box", "lower": (0.1, 0.1), "upper": (0.3, 0.3), "material": "jelly"}
@@ -38,6 +40,10 @@ BOX = {"shape": "box", "lower": (0.1, 0.1), "upper": (0.3, 0.3), "material": "je
         ({"grid__kernel": "linear"}, "grid.kernel: takes one of 'quadratic', 'cubic', got 'linear'"),
         ({"grid__walls": "slippery"}, "grid.walls: "),
         ({"duration": "long"}, "duration: should be a valid number"),
+        ({"material__jelly__E": True}, "material.jelly.E: takes no true or false, got true"),
+        ({"gravity": (False, -9.8)}, "gravity[0]: takes no true or false, got false"),
+        ({"seed": True}, "seed: takes no true or false"),
+        ({"body__0__radius": True, "grid__deterministic": True}, "body[0].radius: takes no true or false"),
         ({"fps": 0}, "fps: should be greater than 0, got 0; takes: frames per second"),
         ({"obstacle": [{"shape": "box", "center": (0, 0), "size": (1, 1), "contact": "sticki"}]},
          "obstacle[0].contact: takes one of 'slip', 'sticky', 'separate', got 'sticki'; did you mean 'sticky'?"),
@@ -108,6 +114,19 @@ def test_files_name_themselves_in_messages(tmp_path):
     path.write_text(FILE.format(duration=1).replace("fps", "fsp"))
     with pytest.raises(SceneError, match=r"scene.toml: fsp: unknown key; did you mean 'fps'"):
         Scene.load(path)
+
+
+def test_keys_that_are_true_or_false():
+    models = [m for m in vars(schema).values() if isinstance(m, type) and issubclass(m, schema.Model)]
+    models += [Dataset, *schema.SOLIDS]
+    found = {name for model in models for name, field in model.model_fields.items() if field.annotation is bool}
+    assert found == set(BOOLEANS)
+
+
+def test_a_byte_order_mark(tmp_path):
+    path = tmp_path / "scene.toml"
+    path.write_bytes(b"\xef\xbb\xbf" + FILE.format(duration=0.04).encode())
+    assert Scene.load(path).duration == 0.04
 
 
 def test_overrides(tmp_path):

@@ -52,8 +52,14 @@ class Rotation(Timed):
 
 
 def in_box(x: Tensor, point: Numbers, size: Numbers) -> Tensor:
-    """Whether positions are in a box of half edges `size` about a point, bool [P]."""
+    """Whether positions are in a box of half edges `size` about a point, bool [P].
+
+    Raises:
+        ValueError: for a negative size, which would select nothing.
+    """
     centre, half = small_vector(point, x.device).to(x.dtype), small_vector(size, x.device).to(x.dtype)
+    if bool((half.detach() < 0).any()):
+        raise ValueError(f"size must not be negative, got {half.tolist()}")
     return ((x.detach() - centre).abs() < half).all(1)
 
 

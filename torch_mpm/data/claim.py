@@ -156,7 +156,7 @@ class Claim:
             good = path.stat().st_size == record.bytes
             if good and check:
                 Shard(path, check=True).close()
-                good = [scene.id for scene in record.scenes] == self.record.ids(shard)
+                good = not record.difference(self.record.configuration, self.record.ids(shard))
         except (FileNotFoundError, DamagedFileError):
             return False
         if good:

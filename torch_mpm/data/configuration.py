@@ -38,7 +38,7 @@ from pydantic import AfterValidator, Field, ValidationError
 from ..files import check_file
 from ..scene import Scene, SceneError, schema
 from ..scene.check import corner_problems
-from ..scene.explain import explain, text_problems
+from ..scene.explain import boolean_problems, explain, text_problems
 from ..scene.scene import override, parsed
 from . import distribution
 from .content_checks import shape_problems, value_problems
@@ -244,7 +244,7 @@ def _checked(words: Words) -> Dataset:
         SceneError: for problems.
     """
     problems = [f"{key}: is not for data sets; {remedy}" for key, remedy in ABSENT.items() if key in words]
-    problems += text_problems(words)
+    problems += [*text_problems(words), *boolean_problems(words)]
     misshapen = list(shape_problems(words))
     problems += misshapen
     dataset = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -9,11 +10,13 @@ from typing import Any
 import numpy as np
 
 from ..errors import DamagedFileError
-from .folder import DatasetFolder, DatasetRecord, finished_shards
-from .metadata import metadata, write_metadata
+from ..files import check_file
+from .folder import LINKED, DatasetFolder, DatasetRecord, finished_shards
+from .metadata import METADATA, metadata, write_metadata
 from .packing import content_hash
 from .shard import REMEDY, SceneRecord, Shard, ShardRecord, StoredScene, record_path, shard_path
 from .statistics import BOUNDARY, Motion, motion_sums
+from .whole_files import CHECKSUM, check_inside, check_record, checksum
 
 STATISTICS = 1e-9
 """Relative difference of sums of a scene that is explained by rounding."""
@@ -43,6 +46,7 @@ def finalize(folder: str | Path) -> dict[str, Any]:
         raise IncompleteError(f"{folder} has no valid scene: {dataset.attempted()[0].failure}")
     try:
         words = metadata(dataset)
+        words[CHECKSUM] = checksum(json.loads(json.dumps(words)))
         write_metadata(dataset.path, words)
     finally:
         dataset.close()
@@ -69,7 +73,7 @@ def _superfluous(path: Path, record: DatasetRecord) -> DamagedFileError:
 
 
 def verify(folder: str | Path) -> Iterator[str]:
-    """All problems of the finished shards of a data set, one line each.
+    """All problems of the finished shards of a data set and of its ``metadata.json``, one line each.
 
     Every file is compared with its checksum and every scene with its hash; the positions of a valid scene must be
     finite and in the domain, other fields finite, and its energy must not grow.
@@ -81,6 +85,7 @@ def verify(folder: str | Path) -> Iterator[str]:
     record = DatasetRecord.read(Path(folder))
     if missing := record.missing(finished):
         yield f"{folder}: {missing} are not there or not finished; generate them"
+    yield from _metadata_problems(Path(folder), record)
     for index in finished:
         path = shard_path(Path(folder), index)
         if index >= record.shards:
@@ -97,10 +102,28 @@ def verify(folder: str | Path) -> Iterator[str]:
             yield str(error)
 
 
+def _metadata_problems(folder: Path, record: DatasetRecord) -> Iterator[str]:
+    """Problem of ``metadata.json``, which may be missing, be without a checksum or be older than an extension."""
+    path, remedy = folder / METADATA, f"torch-mpm finalize {folder} writes it again"
+    try:
+        check_inside(folder, path, LINKED)
+        check_file(path, "metadata", may_be_empty=True)
+        words = json.loads(path.read_bytes())
+        if words.get("configuration", record.configuration) != record.configuration:
+            raise DamagedFileError(path, "is of another data set", remedy)
+        if CHECKSUM in words:
+            check_record(words, path, remedy)
+    except FileNotFoundError:
+        return
+    except (DamagedFileError, OSError) as error:
+        yield str(error)
+    except (ValueError, TypeError, AttributeError, RecursionError) as error:
+        yield f"{path}: is no metadata of a data set ({error}); {remedy}"
+
+
 def _shard_problems(shard: Shard, record: DatasetRecord, index: int) -> Iterator[str]:
-    expected = record.ids(index)
-    if shard.ids != expected:
-        yield f"{shard.path}: has the scenes {shard.ids!s:.100}, not {expected[0]} to {expected[-1]}"
+    if difference := shard.record.difference(record.configuration, record.ids(index)):
+        yield f"{record_path(shard.path)}: {difference}; {REMEDY} (--check does so for all damaged shards)"
     for recorded in shard.record.scenes:
         try:
             problems = list(_scene_problems(shard.scene(recorded.id), recorded, record))

@@ -250,8 +250,8 @@ class DatasetFolder:
         record = ShardRecord.read(path)
         if any(len(s.motion.velocity.sum) != self.record.dim for s in record.scenes if s.motion):
             raise DamagedFileError(path, f"has sums of another number of dimensions than {self.record.dim}", REMEDY)
-        if [scene.id for scene in record.scenes] != self.record.ids(shard):
-            raise DamagedFileError(path, "has other scenes than those of its number", REMEDY)
+        if difference := record.difference(self.record.configuration, self.record.ids(shard)):
+            raise DamagedFileError(path, difference, REMEDY)
         return record
 
     def _shard_path(self, shard: int) -> Path:

@@ -230,7 +230,7 @@ class _Line:
         """Compress the scenes of a shard and write it, concurrently with the work of the device."""
         path = shard_path(self.claim.folder, shard)
         whole: Attributes = {"shard": shard, "device": _device_name(self.device), **versions()}
-        with output_errors(self.claim.folder), ShardWriter(path, whole) as writer:
+        with output_errors(self.claim.folder), ShardWriter(path, whole, self.configuration.hash) as writer:
             for outcome, scene in zip(outcomes, self._packers.map(_prepared, outcomes), strict=True):
                 writer.add(outcome.id, scene, self._attributes(outcome))
                 outcome.arrays, outcome.packed, outcome.behind = {}, {}, {}

@@ -95,15 +95,23 @@ class SceneRecord:
 
 @dataclass(frozen=True)
 class ShardRecord:
-    """Record of a shard: the size [bytes] and the `file_hash` of its file, its scenes, and the SHA-256 of its seal.
+    """Record of a shard: the size [bytes] and the `file_hash` of its file, its scenes, the SHA-256 of its seal, and the
+    hash of the configuration of its data set.
 
-    ``seal`` is "" for shards that were written before shards had seals.
+    ``seal`` and ``configuration`` are "" for shards that were written before shards had them.
     """
 
     bytes: int
     sha256: str
     scenes: list[SceneRecord]
     seal: str = ""
+    configuration: str = ""
+
+    def difference(self, configuration: str, ids: list[int]) -> str:
+        """Difference from the shard of a data set with these scenes; "" for none."""
+        if self.configuration not in ("", configuration):
+            return f"is of another data set ({self.configuration[:12]}, this is {configuration[:12]})"
+        return "" if [scene.id for scene in self.scenes] == ids else "has other scenes than those of its number"
 
     def write(self, path: Path) -> None:
         """Write the record to a file, which appears when it is complete and on the disk."""
@@ -125,7 +133,8 @@ class ShardRecord:
             if words["format"] == FORMAT:
                 check_record(words, path, REMEDY)
             scenes = [SceneRecord.of(s) for s in words["scenes"]]
-            record = cls(count(words["bytes"]), str(words["sha256"]), scenes, str(words.get("seal", "")))
+            later = {name: str(words.get(name, "")) for name in ("seal", "configuration")}
+            record = cls(count(words["bytes"]), str(words["sha256"]), scenes, **later)
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError) as error:
             if isinstance(error, DamagedFileError):
                 raise

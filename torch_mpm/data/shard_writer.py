@@ -27,14 +27,16 @@ class ShardWriter:
     Args:
         path: path of the shard.
         attributes: texts and numbers about the whole shard.
+        configuration: hash of the configuration of its data set.
 
     Raises:
         ImportError: when h5py is missing (extra ``data``).
         OSError: where no file can be created.
     """
 
-    def __init__(self, path: Path, attributes: Attributes | None = None) -> None:
+    def __init__(self, path: Path, attributes: Attributes | None = None, configuration: str = "") -> None:
         h5py = h5py_module()
+        self._configuration = configuration
         self._path, self._building = path, building_path(path)
         self._disk = QuietFile(self._building)
         self._file = h5py.File(self._disk, "w", libver="v110")
@@ -104,7 +106,7 @@ class ShardWriter:
             self._disk.sync()
         appear(self._building, self._path)
         scenes = sorted(self._scenes, key=lambda scene: scene.id)
-        record = ShardRecord(self._path.stat().st_size, digest.result(), scenes, sealed)
+        record = ShardRecord(self._path.stat().st_size, digest.result(), scenes, sealed, self._configuration)
         record.write(record_path(self._path))
         return record
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import codecs
 import csv
 import io
+import itertools
 import math
 import re
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
@@ -21,6 +23,8 @@ FAMILIES = ("", "points?", "positions?", "coordinates?", "coords?", "pos")
 """Prefixes of the names of coordinates, in order of preference: x, Points:0, position_x, ..."""
 VOLUME = re.compile(r"(particle[ _])?vol(ume)?")
 COMMENTS = ("#", "%", "//")
+PROSE = {"a", "and", "are", "as", "by", "for", "in", "is", "not", "of", "on", "or", "over", "the", "to", "with"}
+"""Words of comments that are sentences, such as "x and y", and not names of columns."""
 PLY_TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
     **{"float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2"},
@@ -113,43 +117,84 @@ def _array(handle: IO[bytes], size: int) -> Array:
 
 
 def _read_table(path: Path, dim: int | None) -> PointFile:
-    lines = path.read_text(encoding="utf-8-sig").splitlines()
+    lines = _text(path.read_bytes()).splitlines()
     names, first = _header(lines)
     if first == len(lines):
         raise ValueError("it has no rows of numbers")
     separator = _separator(lines[first])
     axes, volume = _named(names) if names else _unnamed(len(_cells(lines[first], separator)), dim)
-    rows = (line.partition("#")[0] for line in lines[first:] if not line.lstrip().startswith(COMMENTS))
     options: dict[str, Any] = {"delimiter": separator, "comments": None, "quotechar": '"', "ndmin": 2}
-    # Without names, all rows are checked for the same number of columns.
-    values = np.loadtxt(rows, usecols=axes + volume if names else None, **options)
+    values = np.loadtxt(_rows(lines, first, separator), usecols=axes + volume, **options)
     return PointFile(values[:, : len(axes)], values[:, -1] if volume else None, {})
+
+
+def _text(data: bytes) -> str:
+    """Text of a table: UTF-8, UTF-16 with its byte order mark, or Latin-1."""
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return data.decode("utf-16")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return data.decode("latin-1")
+
+
+def _rows(lines: Sequence[str], first: int, separator: str | None) -> Iterator[str]:
+    """Lines of numbers from the first one on, without comments.
+
+    Raises:
+        ValueError: for a line with another number of cells than the first one.
+    """
+    expected = len(_cells(lines[first], separator))
+    for number, line in enumerate(lines[first:], first + 1):
+        text = line.partition("#")[0].strip()
+        if not text or text.startswith(COMMENTS):
+            continue
+        quick = separator is not None and '"' not in text and not text.endswith(separator)
+        count = text.count(separator) + 1 if separator and quick else len(_cells(text, separator))
+        if count != expected:
+            raise ValueError(f"line {number} has {count} columns, and the first row of numbers has {expected}")
+        yield text
 
 
 def _header(lines: Sequence[str]) -> tuple[list[str], int]:
     """Names of columns, or none, and the index of the first row of numbers."""
     names: list[str] = []
-    remark: list[str] = []
+    remarks: list[list[str]] = []
     for index, line in enumerate(lines):
         text = line.strip()
         comment = text.startswith(COMMENTS)
         text = text.lstrip("#%/ ") if comment else text
         cells = _cells(text, _separator(text))
-        columns = [column for axis in _coordinates(cells) for column in axis]
         if comment:
-            remark = cells if columns and columns == list(range(columns[0], columns[-1] + 1)) else remark
-        elif columns and not names:
+            remarks.append(cells[1:] if cells and cells[0].endswith(":") else cells)
+        elif _coordinates(cells) and not names:
             names = cells
         elif cells:
-            if not all(map(_is_number, cells)):
-                raise ValueError(
-                    f"its first line must be numbers or name the columns x, y, (z,) (volume), got {cells}; "
-                    "names such as Points:0 and position_x will do too"
-                )
-            if names and len(names) != len(cells):
-                raise ValueError(f"it names {len(names)} columns {names}, and has {len(cells)} numbers in a row")
-            return names or (remark if len(remark) == len(cells) else []), index
+            names = names or _names_in(remarks, len(cells))
+            _check_first(names, cells)
+            return names, index
     return names, len(lines)
+
+
+def _names_in(remarks: Sequence[Sequence[str]], count: int) -> list[str]:
+    """The last comment that names as many columns and is no prose; empty without one."""
+    named = (cells for cells in reversed(remarks) if len(cells) == count and _coordinates(cells))
+    return list(next((cells for cells in named if PROSE.isdisjoint(map(str.lower, cells))), []))
+
+
+def _check_first(names: Sequence[str], cells: Sequence[str]) -> None:
+    """Check the first row of numbers against the names of the columns, of which others may be texts."""
+    if names and len(names) != len(cells):
+        raise ValueError(f"it names {len(names)} columns {list(names)}, and has {len(cells)} numbers in a row")
+    used = [cells[k] for columns in _named(names) for k in columns] if names else cells
+    if all(map(_is_number, used)):
+        return
+    if names:
+        raise ValueError(f"its first row must have numbers below the names {list(names)}, got {list(cells)}")
+    raise ValueError(
+        f"its first line must be numbers or name the columns x, y, (z,) (volume), got {list(cells)}; "
+        "names such as Points:0 and position_x will do too"
+    )
 
 
 def _separator(line: str) -> str | None:
@@ -160,7 +205,8 @@ def _separator(line: str) -> str | None:
 def _cells(line: str, separator: str | None) -> list[str]:
     text = line.partition("#")[0].strip()
     cells = next(csv.reader([text], delimiter=separator, skipinitialspace=True), []) if separator else text.split()
-    return [cell.strip().strip("\"'") for cell in cells]
+    cells = [cell.strip().strip("\"'") for cell in cells]
+    return cells[:-1] if separator and cells and not cells[-1] else cells  # Lines may end with a separator.
 
 
 def _is_number(cell: str) -> bool:
@@ -229,8 +275,10 @@ def _read_ply(path: Path, dim: int | None) -> PointFile:
         if count == 0:
             raise ValueError("it has no vertices")
         if order == "=":
-            text = io.TextIOWrapper(handle, encoding="ascii")
-            values = np.loadtxt(text, max_rows=count, ndmin=2, usecols=range(len(names)))
+            lines = (line for line in io.TextIOWrapper(handle, encoding="latin-1") if line.strip())
+            values = np.loadtxt(itertools.islice(lines, count), ndmin=2, comments=None)
+            if values.shape[1] != len(names):
+                raise ValueError(f"its rows have {values.shape[1]} numbers, not {len(names)} as its header says")
             fields = {name: values[:, k] for k, name in enumerate(names)}
         else:
             rows = np.frombuffer(handle.read(count * dtype.itemsize), dtype, count)
@@ -247,7 +295,7 @@ def _ply_header(handle: IO[bytes]) -> tuple[str, int, list[str], np.dtype[Any]]:
     if handle.readline(80).strip() != b"ply":
         raise ValueError("it does not begin with 'ply'")
     order, elements, count, properties = "", 0, 0, []
-    while (words := handle.readline(2**12).decode("ascii").split()) != ["end_header"]:
+    while (words := handle.readline(2**12).decode("latin-1").split()) != ["end_header"]:
         match words:
             case ["format", name, _] if name in PLY_ORDERS:
                 order = PLY_ORDERS[name]
@@ -265,6 +313,8 @@ def _ply_header(handle: IO[bytes]) -> tuple[str, int, list[str], np.dtype[Any]]:
             case _:
                 raise ValueError(f"its header has an unknown line: {' '.join(words)!r}")
     names = [name for name, _ in properties]
-    if not order or not {"x", "y", "z"} <= set(names):
+    if not order:
+        raise ValueError("its header has no line with the format, such as 'format ascii 1.0'")
+    if not {"x", "y", "z"} <= set(names):
         raise ValueError(f"its vertices must have the properties x, y and z, got {names}")
     return order, count, names, np.dtype(properties)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import codecs
 import os
 import warnings
 from pathlib import Path
@@ -14,6 +13,7 @@ from .. import optional
 from ..errors import shape_of
 from ..files import check_file
 from ..geometry.surface_mesh import Array
+from . import obj
 
 MERGED = 1e-5
 """Distance within which vertices on open edges are merged, in diagonals of the mesh."""
@@ -102,14 +102,15 @@ def triangles(source: str | Path | Any) -> tuple[Array, Array]:
 
 
 def _read(path: Path) -> Any:
-    """A file read by trimesh, which would skip a line of an .obj that begins with a byte order mark."""
+    """A mesh of a file; trimesh reads all formats but .obj.
+
+    It would read negative indices of an .obj as those of the last object of the file.
+    """
     import trimesh
 
-    kind = path.suffix.lower().removeprefix(".")
-    with path.open("rb") as file:
-        if kind != "obj" or file.read(len(codecs.BOM_UTF8)) != codecs.BOM_UTF8:
-            return trimesh.load(str(path), force="mesh", resolver=_resolver(path))
-        return trimesh.load(file, file_type=kind, force="mesh", resolver=_resolver(path))
+    if path.suffix.lower() == ".obj":
+        return trimesh.Trimesh(*obj.read(path), process=False)
+    return trimesh.load(str(path), force="mesh", resolver=_resolver(path))
 
 
 def edge_uses(faces: Array) -> tuple[Array, Array, Array]:

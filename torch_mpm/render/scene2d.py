@@ -14,6 +14,9 @@ from .shapes import Array, Shape
 
 Overlay = tuple[Array, str, str]
 
+SMALLEST = 0.1
+"""Least share of the width and the height for the axes; the text of smaller pictures is cut off."""
+
 
 class Scene2D:
     """One figure that is drawn again for every frame; `to_pixels` gives where a point [m] lands in the picture."""
@@ -29,11 +32,11 @@ class Scene2D:
         self.figure, self.size = figure(resolution), font_size(resolution)
         self.resolution = resolution
         lower, upper = bounds
-        left = (5 if origin is None else 8) * self.size * DPI / 72 / resolution[0]
-        width = 0.97 - left - (scale_width(resolution) if scale else 0)
+        left = min((5 if origin is None else 8) * self.size * DPI / 72 / resolution[0], 0.6)
+        width = max(0.97 - left - (scale_width(resolution) if scale else 0), SMALLEST)
         line = self.size * DPI / 72 / resolution[1]  # Share of the height of a line of text.
         bottom, top = max(0.11, 3.8 * line), max(0.11, 2.6 * line)
-        height = 1 - bottom - top
+        bottom, height = min(bottom, 0.6), max(1 - bottom - top, SMALLEST)
         aspect = exaggeration * (upper[1] - lower[1]) / (upper[0] - lower[0]) * resolution[0] / resolution[1]
         fitted = (width, width * aspect) if width * aspect <= height else (height / aspect, height)
         corner = (left + 0.5 * (width - fitted[0]), bottom + 0.5 * (height - fitted[1]))

@@ -13,7 +13,7 @@ from ..data.clips import Source
 from ..data.trajectory import Array
 from .cloud import rest_spacing
 from .colors import PALETTES, QUANTITIES, Quantity, map_colors, palette_colors, value_range
-from .viewer_server import viser_server
+from .viewer_server import page_address, viser_server
 
 PLAYED_FPS = 30
 COUNTED = ("particle_type", *PALETTES)
@@ -40,7 +40,7 @@ class Viewer:
     def __init__(self, path: str | Path, port: int = 8080, host: str = "127.0.0.1") -> None:
         self.source = Source(path)
         self._server: Any = viser_server(host, port)
-        self.url = f"http://{host}:{self._server.get_port()}"
+        self.url = page_address(host, self._server.get_port())
         self._lock, self._stop = threading.Lock(), threading.Event()
         first = next(iter(self.source.scenes))
         self.clip = self.source.clip(first)

@@ -50,6 +50,11 @@ def _check_address(host: str, port: int) -> None:
             raise OSError(f"host: cannot listen at {host!r}, port {port}: {error}") from None
 
 
+def page_address(host: str, port: int) -> str:
+    """Address of the page of a server; an IPv6 address is in brackets."""
+    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+
+
 def _guarded(serve: Callable[..., Any], host: str) -> Callable[..., Any]:
     """`serve` of websockets that rejects connections from pages of other sites."""
 
@@ -76,7 +81,10 @@ def is_own_page(origin: str | None, requested: str | None, host: str) -> bool:
     """
     if origin is None:
         return True
-    page = urlsplit(origin)
+    try:
+        page = urlsplit(origin)
+    except ValueError:  # Such as a bracket that is not closed.
+        return False
     if page.scheme not in ("http", "https") or page.netloc != requested:
         return False
     return not _is_loopback(host) or _is_loopback(page.hostname or "")

@@ -20,6 +20,8 @@ MOST_LETTERS = 1000
 """Maximum length of a problem in the message: values of files may be long."""
 UNWRITABLE = re.compile(r"\\u0000|[\ud800-\udfff]")
 """Null characters and lone surrogates in a JSON text."""
+BOOLEANS = ("deterministic", "volume_correction", "vtk", "ply", "video", "project", "obstacles")
+"""Keys of scene files and of [dataset] that are true or false."""
 
 
 class SceneError(ValueError):
@@ -60,6 +62,19 @@ def _unwritable(words: Any, path: str) -> Iterator[str]:
             yield from _unwritable(item, f"{path}[{k}]")
     elif isinstance(words, str) and ("\0" in words or any("\ud800" <= letter <= "\udfff" for letter in words)):
         yield f"{path}: has letters that no file can hold, got {words!a}"
+
+
+def boolean_problems(words: Any, path: str = "") -> Iterator[str]:
+    """One line for each true or false of a key that takes numbers: pydantic would read them as 1 and 0."""
+    if isinstance(words, dict):
+        for key, value in words.items():
+            if key not in BOOLEANS:
+                yield from boolean_problems(value, f"{path}.{key}" if path else str(key))
+    elif isinstance(words, (list, tuple)):
+        for k, item in enumerate(words):
+            yield from boolean_problems(item, f"{path}[{k}]")
+    elif isinstance(words, bool):
+        yield f"{path}: takes no true or false, got {str(words).lower()}"
 
 
 def explain(error: ValidationError, root: type[BaseModel] = SceneData) -> list[str]:

@@ -6,6 +6,7 @@ import contextlib
 import errno
 import fcntl
 import json
+import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import Any
 
 from ..data.hdf5 import h5py_module
 from ..data.host_memory import in_words
-from ..data.trajectory import COMPLETE, PARTIAL, Layout, Trajectory, create
+from ..data.trajectory import COMPLETE, PARTIAL, Layout, Trajectory, create, find
 from ..data.whole_files import check_inside, check_record, write_record
 from ..errors import DamagedFileError, is_finite
 from ..files import check_file
@@ -66,13 +67,27 @@ def _check_links(folder: Path) -> None:
 def finished(folder: Path, fingerprint: str) -> dict[str, Any] | None:
     """Summary of a complete run of a scene; None where there is none. Empty where a kill prevented its writing.
 
+    Frames are not read: their checksums are compared when they are used.
+
     Raises:
-        DamagedFileError: for a damaged record.
+        DamagedFileError: for a damaged record, and for a trajectory that is damaged or of another run.
+        OSError: for a trajectory that cannot be read.
     """
-    if not (folder / RUN).is_file() or not (folder / COMPLETE).exists():
+    if not (folder / RUN).is_file() or not os.path.lexists(folder / COMPLETE):
         return None
     record = read_run(folder)
-    return record.get(SUMMARY, {}) if record["fingerprint"] == fingerprint else None
+    if record["fingerprint"] != fingerprint:
+        return None
+    _check_trajectory(folder / COMPLETE, fingerprint)
+    summary: dict[str, Any] = record.get(SUMMARY, {})
+    return summary
+
+
+def _check_trajectory(path: Path, fingerprint: str) -> None:
+    check_file(path, "trajectory", largest=None, may_be_empty=True)
+    with Trajectory(path) as trajectory:
+        if trajectory.attributes.get("fingerprint") != fingerprint:
+            raise DamagedFileError(path, f"is not the trajectory of the run in {RUN}", REMEDY)
 
 
 @contextlib.contextmanager
@@ -195,7 +210,5 @@ def load_run(folder: str | Path, overrides: list[str] | None = None) -> Scene:
     _check_links(folder)
     h5py_module()
     record = read_run(folder)
-    with Trajectory(folder) as trajectory:
-        if trajectory.attributes.get("fingerprint") != record["fingerprint"]:
-            raise DamagedFileError(trajectory.path, f"is not the trajectory of the run in {RUN}", REMEDY)
+    _check_trajectory(find(folder), record["fingerprint"])
     return Scene.from_words(record["scene"], overrides, Path(record["folder"]), source=str(folder / RUN))

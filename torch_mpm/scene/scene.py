@@ -17,7 +17,7 @@ from ..geometry.seed import on_host
 from . import check, partial, schema
 from .build import Built, build
 from .entry import ResolvedEntry
-from .explain import SceneError, explain, text_problems
+from .explain import SceneError, boolean_problems, explain, text_problems
 from .fields import RANKS
 from .places import relative
 
@@ -55,6 +55,8 @@ class Scene(schema.SceneData):
             super().__init__(**words)
         except ValidationError as error:
             raise SceneError([*explain(error), *partial.problems(words)]) from None
+        if problems := list(boolean_problems(words)):
+            raise SceneError(problems)
 
     @classmethod
     def load(cls, path: str | Path, overrides: list[str] | None = None) -> Scene:

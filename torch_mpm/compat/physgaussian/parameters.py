@@ -92,7 +92,10 @@ def checked(name: str, value: Any, like: Tensor) -> Any:
 def _in_range(name: str, value: Any, like: Tensor) -> float | Tensor:
     expected, holds = RANGES[name]
     if not isinstance(value, Tensor) and not hasattr(value, "__len__"):
-        return float(check_number(name, value, expected, lambda v: math.isfinite(v) and bool(holds(v))))
+        number = float(check_number(name, value, expected, lambda v: math.isfinite(v) and bool(holds(v))))
+        if abs(number) > (most := torch.finfo(like.dtype).max):
+            raise ValueError(f"{name} must be at most {most:.2g}, the largest number of {like.dtype}, got {number:g}")
+        return number
     try:
         tensor = torch.as_tensor(value, dtype=like.dtype, device=like.device)
     except (TypeError, ValueError, RuntimeError):

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..export import Array, write_ply, write_vtk
-from ..folder import DatasetFolder, velocity_of
+from ..folder import DatasetError, DatasetFolder, velocity_of
 from ..shard import StoredScene, scene_name
 from ..whole_files import output_path
 from .common import new_folder
@@ -31,6 +31,7 @@ def export_scenes_vtk(
     Raises:
         FileExistsError: when ``out`` exists already.
         KeyError: for a scene that does not exist, failed, or is not finished.
+        DatasetError: for no scene.
         DamagedFileError: for a shard of these scenes that is damaged: its checksum is verified first.
         ImportError: when meshio is missing (extra ``data``).
     """
@@ -54,6 +55,8 @@ def _export(
     dataset = source if isinstance(source, DatasetFolder) else DatasetFolder(source)
     target = output_path(dataset.path, name, out)
     chosen = [scene.id for scene in dataset.scenes()[:1]] if scenes is None else scenes
+    if not chosen:
+        raise DatasetError(f"{dataset.path} has no valid scene yet" if scenes is None else "scenes must not be empty")
     stored = {number: dataset.scene(number) for number in chosen}
     dataset.check(chosen)
     with new_folder(target) as folder:
