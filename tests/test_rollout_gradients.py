@@ -196,7 +196,7 @@ def test_recorded_steps_in_checkpoints_of_torch(device):
         def taken(v: Tensor) -> Tensor:
             return mpm.rollout(step, state.replace(v=v), 3, DT, checkpoint=ALL).x
 
-        options = {"use_reentrant": False, "context_fn": mpm.checkpoints.contexts}
+        options = {"use_reentrant": False, "context_fn": mpm.rollouts.checkpoints.contexts}
         x = torch.utils.checkpoint.checkpoint(taken, v, **options) if around else taken(v)
         return torch.autograd.grad(x.square().sum(), v)[0]
 

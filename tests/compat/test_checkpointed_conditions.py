@@ -33,7 +33,9 @@ CONDITIONS = {
 CHECKPOINTS = {
     "reentrant": lambda f, *tensors: checkpoint(f, *tensors, use_reentrant=True),
     "not reentrant": lambda f, *tensors: checkpoint(f, *tensors, use_reentrant=False),
-    "with pools": lambda f, *tensors: checkpoint(f, *tensors, use_reentrant=False, context_fn=mpm.checkpoints.contexts),
+    "with pools": lambda f, *tensors: checkpoint(
+        f, *tensors, use_reentrant=False, context_fn=mpm.rollouts.checkpoints.contexts
+    ),
 }
 
 

@@ -311,7 +311,7 @@ def test_a_finished_run_with_a_damaged_trajectory_is_not_reported_as_complete(da
     assert main(resume) == 0 and main(resume) == 0
     assert "holds the complete run of this scene" in capsys.readouterr().out
     FINISHED[damage](unfinished / "trajectory.h5")
-    assert "trajectory.h5" in told(capsys, *resume)
+    assert "trajectory.h5" in printed(capsys, *resume)
 
 
 def test_the_trajectory_of_another_finished_run(unfinished, scene, tmp_path, capsys):
@@ -319,4 +319,4 @@ def test_the_trajectory_of_another_finished_run(unfinished, scene, tmp_path, cap
     other = ["run", str(scene), "-o", str(tmp_path / "other"), "--quiet", "--set", "gravity=[0.0, -5.0]"]
     assert main(resume) == 0 and main(other) == 0
     shutil.copy(tmp_path / "other" / "trajectory.h5", unfinished / "trajectory.h5")
-    assert "is not the trajectory of the run in run.json" in told(capsys, *resume)
+    assert "is not the trajectory of the run in run.json" in printed(capsys, *resume)
