@@ -17,7 +17,7 @@ def read(path: Path) -> tuple[Array, Array]:
     """Vertices float64 [V, 3] that faces use, and triangles int64 [T, 3]; both empty without faces.
 
     Objects, groups and materials are one mesh. A negative index counts back from the latest vertex above its line.
-    Polygons are fans of triangles; lines, textures and normals are left out.
+    Polygons are fans of triangles; lines, textures and normals are skipped.
 
     Raises:
         ValueError: for a vertex or a face that is not of numbers, and an index without a vertex, with its line, where
