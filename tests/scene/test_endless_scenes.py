@@ -31,7 +31,7 @@ def test_scenes_that_would_never_end(tmp_path, capsys, command, override, key):
     assert f"{key}:" in message and not (tmp_path / "out").exists(), message
 
 
-def test_the_number_of_substeps_is_told(tmp_path, capsys):
+def test_the_number_of_substeps_is_reported(tmp_path, capsys):
     scene = tmp_path / "scene.toml"
     scene.write_text(FILE.format(duration=0.04))
     assert main(["check", str(scene), "--set", "dt=1e-5"]) == 0

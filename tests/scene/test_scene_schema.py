@@ -339,7 +339,7 @@ def test_overlaps_show_beside_other_mistakes():
     assert [problem[:20] for problem in error.value.problems] == ["body[2]: reaches fro", "body[0]: overlaps bo"]
 
 
-def test_a_missing_material_is_not_told_twice():
+def test_a_missing_material_is_not_reported_twice():
     words = disc(material={"jelly": {"law": "neo_hookean", "E": 1.0, "nu": 0.7}})
     with pytest.raises(SceneError) as error:
         Scene(**words)
