@@ -156,7 +156,7 @@ def _parser() -> argparse.ArgumentParser:
     check.set_defaults(command=_check)
 
     info = commands.add_parser(
-        "info", help="fields, memory and run time of a scene; without a scene, properties of this installation"
+        "info", help="fields, memory, run time and plan of a scene; without a scene, properties of this installation"
     )
     _scene_arguments(info, optional=True)
     info.set_defaults(command=_info)

@@ -124,6 +124,8 @@ def test_info_lists_what_the_scene_uses(scene, capsys):
     assert printed["fields"].strip() == "x 8, v 8, mass 4, volume 4, C 16, F 16, ids 8"
     assert printed["bytes per particle"].strip() == "64"
     assert float(printed["time step [s]"]) > 0 and float(printed["estimated run time [s]"]) > 0
+    assert printed["plan"].strip() == "all steps in one op (executor fused, schedule sorted_cpu)"
+    assert {"not loop", "not replay", "not graph", "not per_step", "not persistent"} < printed.keys()
     assert main(["info"]) == 0
     assert "torch:" in capsys.readouterr().out
 

@@ -14,7 +14,10 @@ from helpers import FILE, disc
 pytest.importorskip("pydantic")
 
 import torch_mpm as mpm
+from torch_mpm.rollouts.plan import SCHEDULES
 from torch_mpm.scene import Scene, SceneError, json_schema
+from torch_mpm.scene.describe import halfway, plan_in_words
+from torch_mpm.scene.substeps import time_step
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.toml"))
 BOX = {"shape": "box", "lower": (0.1, 0.1), "upper": (0.3, 0.3), "material": "jelly"}
@@ -161,14 +164,28 @@ def test_descriptions_reach_the_schema():
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda p: p.stem)
-def test_examples_build(path):
+def test_examples_build_and_name_their_plan(path):
     scene = Scene.load(path, ["device=cpu"])
     if any(getattr(body, "shape", None) == "mesh" for body in scene.body):
         pytest.importorskip("trimesh")
     if path.stem == "demo":
-        assert scene.dim == 3 and scene.render.video and scene.build().particles >= 100_000
+        assert scene.dim == 3 and scene.render.video
+    built = scene.build()
+    assert built.particles >= (100_000 if path.stem == "demo" else 1001)
+    state = halfway(built)
+    dt, substeps = time_step(scene, built, state)
+    headline, *others = plan_in_words(scene, built, state.sorted(built.grid), dt, substeps).items()
+    executors, schedules = {"fused", "replay", "graph", "loop"}, set(SCHEDULES)
+    if scene.heat is None:
+        chosen = {"fused", "sorted_cpu"}
+        assert "(executor fused, schedule sorted_cpu)" in headline[1]
     else:
-        assert scene.build().particles > 1000
+        chosen = {"loop", *schedules}  # Schedules are those of the fused op.
+        assert headline[1].startswith("step by step, because it conducts heat (executor loop)")
+    assert headline[0] == "plan" and {name for name, _ in others} == {
+        f"not {name}" for name in (executors | schedules) - chosen
+    }
+    assert all(len(reason) > 10 for _, reason in others)
 
 
 # ---- what a scene becomes
