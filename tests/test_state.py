@@ -255,6 +255,8 @@ def test_steps_change_the_fields_that_their_role_names(name, device):
     step, state = step_and_state_with_all_fields(device)
     before, after = (getattr(s, name) for s in (state, step(state, 1e-3)))
     assert torch.equal(before, after) == (ROLES[name].changed_by is None)
+    step.heat = None
+    assert torch.equal(before, getattr(step(state, 1e-3), name)) == (ROLES[name].changed_by != "motion")
 
 
 @pytest.mark.parametrize("name", [name for name in PARTICLE_FIELDS if name not in ("scene", "ids", "material")])
