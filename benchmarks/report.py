@@ -38,8 +38,8 @@ def speed(results: list[dict[str, Any]]) -> str:
     """Whole steps compared with the peers, with the environments, and the parts compared with the memory."""
     notes = [f"- {common.describe(result['environment'])}" for result in results]
     figure = (
-        "The bytes that a part must move, over its time. The line is a copy of an uncached tensor, which writes half "
-        "of its bytes: parts that mostly read, or on the CPU find some of their data in the cache, may exceed it. "
+        "The bytes that a part must move, over its time.\nThe line is a copy of an uncached tensor, which writes half "
+        "of its bytes: parts that mostly read, or on the CPU find some of their data in the cache, may exceed it.\n"
         "Marks, in results that have them, are the faster of a copy and a read of as many bytes as the part."
     )
     picture = "![bytes per second of each part, and of a copy](benchmarks/results/roofline.png)"
@@ -72,7 +72,7 @@ def speed_table(results: list[dict[str, Any]]) -> str:
         "float32 error",
     )  # fmt: skip
     intro = (
-        "One explicit neo-Hookean step, 3-D, float32, quadratic kernel, 8 particles per cell, everything included. "
+        "One explicit neo-Hookean step, 3-D, float32, quadratic kernel, 8 particles per cell, everything included.\n"
         "Columns with x are multiples of its time in the same run; rates are in billions of particles per second; the "
         "error is the largest of P2G, G2P and their gradients against float64."
     )
@@ -90,7 +90,7 @@ def as_run(results: list[dict[str, Any]]) -> str:
     header = ("device", "", "particles", "substeps", "us per substep", "M particles/s", "simulation, s")
     return "\n".join(
         [
-            "Substeps of one call of `rollout` (the neo-Hookean cube), and scenes by `torch-mpm run` with their files",
+            "Substeps of one call of `rollout` (the neo-Hookean cube), and scenes by `torch-mpm run` with their files "
             "(benchmarks/speed/rollouts.py).",
             *("", common.table(header, rows), "", *notes, ""),
             *beside_peers(results),
@@ -110,10 +110,10 @@ def beside_peers(results: list[dict[str, Any]]) -> list[str]:
     peers = common.table(header, rows("peers", row_of_peer))
     header = ("device", "scene", "particles of Warp's step", "us", "speed-up by the scene")
     return [
-        "Steps of the same work by peers, in plain standard use: Warp by CUDA graphs on a GPU, scenes of a batch",
+        "Steps of the same work by peers, in plain standard use: Warp by CUDA graphs on a GPU, scenes of a batch "
         "side by side in one dense grid:",
         *("", peers, ""),
-        "Warp's step launched from Python, of a neo-Hookean cube with about as many particles as a scene, which has",
+        "Warp's step launched from Python, of a neo-Hookean cube with about as many particles as a scene, which has "
         "additional laws, obstacles, heat and output:",
         *("", common.table(header, rows("plain", row_beside)), ""),
     ]
@@ -151,7 +151,7 @@ def peers_of_training(results: list[dict[str, Any]], projects: Sequence[str]) ->
     intro = (
         "A fixed corotated cube in a rollout, in a script of another project, and by the algorithm of that project "
         "(benchmarks/speed/training_scripts.py), with the gradient by the velocities at the start; columns with x are "
-        "multiples of the rollout of the same work. The algorithms of NCLaw and PhysGaussian use Warp, which has one "
+        "multiples of the rollout of the same work.\nThe algorithms of NCLaw and PhysGaussian use Warp, which has one "
         "thread on CPUs."
     )
     return "\n\n".join([intro, common.table(("device", *speed_of_training.BESIDE), rows)])
@@ -212,7 +212,7 @@ def convergence(result: dict[str, Any]) -> str:
         rows.append((case["name"], last["n"], order, last["displacement"], last["seconds"]))
     intro = (
         "A manufactured solution (benchmarks/accuracy/convergence.py), one period; errors relative to the amplitude on "
-        "the finest lattice, order fitted over all. `slip` walls limit the order to 1, `mirror` walls restore 2."
+        "the finest lattice, order fitted over all.\n`slip` walls limit the order to 1, `mirror` walls restore 2."
     )
     figure = "![error over dx and over run time](benchmarks/results/convergence.png)"
     return "\n".join([intro, "", common.table(header, rows), "", figure])
@@ -233,7 +233,7 @@ def dam_break(result: dict[str, Any]) -> str:
         "benchmarks/accuracy/ritter.py): largest distance between the fronts of some depths and Ritter's, relative to "
         "the distance of his dry front, for t √(g/h0) from "
         f"{result['judged']:g} to {result['cases'][0]['duration']:g}; and the position of the foremost particle at the "
-        "end. 9 particles per cell and mirror walls unless stated otherwise."
+        "end.\n9 particles per cell and mirror walls unless stated otherwise."
     )
     figure = "![depth, fronts over time, errors over dx](benchmarks/results/ritter.png)"
     return "\n".join(
@@ -264,7 +264,7 @@ def stability(result: dict[str, Any]) -> str:
     intro = (
         "Largest stable time step in multiples of `step.stable_dt(state, cfl=1)`, the least over "
         f"E = {', '.join(f'{E:.0e}' for E in sorted({c['E'] for c in cases}))} Pa; s < 1 is uniform compression, s > 1 "
-        "stretch at constant volume. Other layouts, transfers and kernels: benchmarks/results/stability.md."
+        "stretch at constant volume.\nOther layouts, transfers and kernels: benchmarks/results/stability.md."
     )
     return "\n".join([intro, "", common.table(("D", "s", *(f"ν = {nu:g}" for nu in ratios)), rows)])
 
@@ -282,7 +282,7 @@ def stability_laws(result: dict[str, Any]) -> str:
         "The same for the other laws, the least over 2-D and 3-D, "
         f"ν = {', '.join(f'{nu:g}' for nu in sorted({c['nu'] for c in cases}))} and "
         f"E = {', '.join(f'{E:.0e}' for E in sorted({c['E'] for c in cases}))} Pa, where the law is "
-        "elliptic (elsewhere disturbances grow with any time step). By ν: benchmarks/results/stability_laws.md."
+        "elliptic (elsewhere disturbances grow with any time step).\nBy ν: benchmarks/results/stability_laws.md."
     )
     return "\n".join([intro, "", common.table(("law", *(f"s = {s:g}" for s in stretches)), rows)])
 
@@ -345,8 +345,8 @@ def adversarial(result: dict[str, Any]) -> str:
     intro = (
         f"Random rollouts of {result['steps']} steps that are meant to invert particles, at up to three times the "
         "speed of sound (benchmarks/stability/adversarial.py), with dt = `step.stable_dt(state, cfl)` computed anew at "
-        "every step: number of failures, by cfl. Flattened: the stretch of a particle fell below rounding "
-        "error before its sign was lost, which a law of finite energy cannot prevent. Energy: above 1.1 times the "
+        "every step: number of failures, by cfl.\nFlattened: the stretch of a particle fell below rounding "
+        "error before its sign was lost, which a law of finite energy cannot prevent.\nEnergy: above 1.1 times the "
         "initial one in a closed system without FLIP."
     )
     parts = [intro, rollouts(result, "law")]
@@ -378,7 +378,7 @@ def svd_accuracy(result: dict[str, Any]) -> str:
     ]
     intro = (
         "float32, the largest over 20 thousand matrices of each kind: error of a singular value relative to itself, "
-        "and of U diag(σ) Vᵀ relative to the largest singular value. Medians: benchmarks/results/svd_accuracy.md."
+        "and of U diag(σ) Vᵀ relative to the largest singular value.\nMedians: benchmarks/results/svd_accuracy.md."
     )
     return "\n".join([intro, "", common.table(header, rows)])
 
@@ -397,7 +397,7 @@ def sand_accuracy(result: dict[str, Any]) -> str:
     worst = max(row["reference against 50 digits"] for row in result["rows"])
     intro = (
         "The return map against extended precision (benchmarks/accuracy/sand.py): mean strains 1e-8 to 0.5, overshoot "
-        "1e-3 to 1e4, all Lode angles, φ 1° to 60°, ν 0 to 0.49; largest errors. The reference itself differs from 50 "
+        "1e-3 to 1e4, all Lode angles, φ 1° to 60°, ν 0 to 0.49; largest errors.\nThe reference itself differs from 50 "
         f"digits by at most {worst:.0e} over the condition."
     )
     return "\n".join([intro, "", common.table(header, rows)])
@@ -418,7 +418,7 @@ def sand_gradient(result: dict[str, Any]) -> str:
     intro = (
         "float32 gradients of the new F and of the stress on the cone against float64 at the same F, by the gap of two "
         f"singular values: the largest relative error of {states / 1e6:.2g} million states with mean strains from "
-        "1e-4 to 0.2 (benchmarks/accuracy/sand_gradient.py). The last columns are the largest error over the usual "
+        "1e-4 to 0.2 (benchmarks/accuracy/sand_gradient.py).\nThe last columns are the largest error over the usual "
         "norm of the gradient, and what one unit in the last place of F changes in the exact gradient."
     )
     header = ("gradient of", *(f"gap {gap:g}" for gap in gaps), "F = I", "usual norm", "one unit of F")
@@ -440,9 +440,9 @@ def heat(result: dict[str, Any]) -> str:
     lost = result["float32"]
     intro = (
         "Relative error on the finest lattice, with the order over all in brackets (benchmarks/accuracy/heat.py): RMS "
-        "of the temperature, position of the melting front; time of the hybrid [s]. 200 steps with a diffusion number "
+        "of the temperature, position of the melting front; time of the hybrid [s].\n200 steps with a diffusion number "
         f"r = 1e-5 around 300 K in float32 lose {lost['relative to 300 K']:.1%} of the change, with temperatures "
-        "relative to 300 K. Errors of the front below 1e-3 change sign with dx, so that an order fitted to them has "
+        "relative to 300 K.\nErrors of the front below 1e-3 change sign with dx, so that an order fitted to them has "
         "little meaning."
     )
     header = ("problem", "r", "n", "run time [s]", *(f"{t}, cubic" if k == "cubic" else t for k, t in forms))
@@ -461,7 +461,7 @@ def heat_solve(result: dict[str, Any]) -> str:
     intro = (
         "Number of iterations, and relative RMS error against a direct solve (benchmarks/stability/heat.py), for "
         "64 × 64 cells, half of which conduct worse by the factor `contrast`; solved to 1e-10 (float32: 1e-6) of the "
-        "first residual. Smaller r and Chebyshev iteration: benchmarks/results/heat_stability.md."
+        "first residual.\nSmaller r and Chebyshev iteration: benchmarks/results/heat_stability.md."
     )
     return "\n\n".join([intro, common.table(("r", "contrast", *kinds), rows)])
 
@@ -496,7 +496,7 @@ def heat_speed(results: list[dict[str, Any]]) -> str:
         for row in result.get("large", [])
     ]
     intro = (
-        "3-D, float32, quadratic kernel, 8 particles per cell (benchmarks/speed/heat.py). The peer's matrix is "
+        "3-D, float32, quadratic kernel, 8 particles per cell (benchmarks/speed/heat.py).\nThe peer's matrix is "
         "assembled beforehand; on the CPU its time includes the assembly."
     )
     parts = [intro, common.table(header, rows)]

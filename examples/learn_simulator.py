@@ -126,7 +126,7 @@ def neighbours(x: Tensor, scene: Tensor, radius: float) -> tuple[Tensor, Tensor]
 
 
 def train(
-    model: Simulator, batches: Iterator[dict[str, Tensor]], steps: int, told: Callable[[str], None] = print
+    model: Simulator, batches: Iterator[dict[str, Tensor]], steps: int, report: Callable[[str], None] = print
 ) -> list[float]:
     """Train for some steps; returns the loss of each."""
     optimizer = torch.optim.Adam(model.parameters(), lr=2e-3)
@@ -142,7 +142,7 @@ def train(
         losses.append(loss.detach())
         if step % max(1, steps // 20) == 0:
             mean = float(torch.stack(losses[-max(1, steps // 20) :]).mean())
-            told(f"step {step:5d} of {steps}  loss {mean:.4f}  {time.perf_counter() - begin:.0f} s")
+            report(f"step {step:5d} of {steps}  loss {mean:.4f}  {time.perf_counter() - begin:.0f} s")
     return torch.stack(losses).tolist()
 
 

@@ -258,7 +258,7 @@ def test_times_that_are_not_finite(device):
     step.check(arrival.state)
 
 
-def test_limits_that_shrink_are_told(device):
+def test_limits_that_shrink_are_reported(device):
     """The body accelerates within a segment; its dt was chosen at rest."""
     often, seldom = (
         mpm.rollout_to(step_of(2, 1e5, gravity=(0.0, -300.0)), blob(device, 2, F64), 0.03, every=every)
@@ -280,7 +280,7 @@ def test_empty_scenes_and_no_particles(device):
     assert bool(nothing.arrived.all()) and len(nothing.state) == 0
 
 
-def test_a_scene_that_is_lost_arrives_and_is_told(device):
+def test_a_scene_that_is_lost_arrives_and_is_reported(device):
     state = batch(device, 2)
     state.v[:60] = math.nan
     step = step_of(2, STIFFNESS, scenes=3, device=device)

@@ -97,7 +97,7 @@ def test_a_reset_replaces_scenes_and_leaves_the_others(device, form):
     assert envs.time.tolist() == pytest.approx([2 * N * DT, N * DT, 2 * N * DT, N * DT])
 
 
-def test_a_lost_scene_is_frozen_told_of_and_reset(device):
+def test_a_lost_scene_is_frozen_reported_and_reset(device):
     envs, other = environments(device), environments(device)
     v = envs.observe("v").clone()
     v[2] = torch.nan

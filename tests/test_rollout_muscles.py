@@ -125,7 +125,7 @@ def test_a_controller_over_time(dtype, device):
 
 
 @torch.no_grad()
-def test_an_activation_that_is_no_number_is_told(device):
+def test_an_activation_that_is_no_number_is_reported(device):
     """Not hidden, as a controller that diverges would like to be."""
     step = mpm.Step(unit_box(), mpm.Active(mpm.NeoHookean(E=1e4, nu=0.3), (1.0, 0.0, 0.0)))
     state = step.prepare(blob(device))

@@ -196,7 +196,7 @@ def test_a_full_pool_is_reported_by_the_call_that_fills_it(device):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
-def test_a_pool_that_was_too_small_for_some_steps_is_told_when_it_has_grown(device, dtype):
+def test_a_pool_that_was_too_small_for_some_steps_is_reported_when_it_has_grown(device, dtype):
     """On CUDA the pool grows between calls; on the CPU within them, so that there is nothing to report."""
     step = mpm.Step(unit_box(2, dx=0.005), mpm.NeoHookean(E=1e3, nu=0.3), transfer="pic")
     state = blob(device, 2, 200, dtype=dtype)

@@ -5,6 +5,9 @@ import torch
 from torch import Tensor
 
 import torch_mpm as mpm
+from benchmarks.catalogue.scenes import block_state, make_step
+from torch_mpm.rollouts import checkpoints, facts, gradient_norms, graph_segments, memory
+from torch_mpm.state.state import CONSTANTS, FIELDS, PARTICLE_FIELDS, ROLES, TRACKED
 
 
 def block(count: int, device: str = "cpu", at: float = 0.3, **fields: object) -> mpm.State:
@@ -219,3 +222,73 @@ def test_copies_share_nothing_that_is_replaced():
     assert changed.x is state.x and not torch.equal(changed.v, state.v)
     with pytest.raises(ValueError, match="v must have shape"):
         state.replace(x=state.x[1:])
+
+
+# ---- roles of fields
+
+
+def step_and_state_with_all_fields(device: str) -> tuple[mpm.Step, mpm.State]:
+    """A step that reads all fields and changes all that a step may change, and a state with all fields."""
+    step = make_step(2, gravity=(0.3, -9.8), walls="slip", compensated=True)
+    step.heat = mpm.Heat(step.grid, 2.0, 1.0, transfer="flip")
+    state = block_state(2, device, low=0.02, high=0.4)  # Touches walls.
+    P = len(state)
+    indices = {name: torch.zeros(P, dtype=torch.int32, device=device) for name in ("scene", "material")}
+    state = state.replace(
+        **indices,
+        v=torch.rand_like(state.v),
+        C=torch.rand(P, 2, 2, dtype=torch.float64).to(device),
+        F=torch.eye(2, dtype=torch.float64, device=device) + 0.01 * torch.rand(P, 2, 2, device=device).double(),
+        J=torch.ones_like(state.mass),
+        ids=torch.arange(P, device=device),
+        temperature=torch.rand_like(state.mass),
+        extra={"history": torch.zeros_like(state.mass)},
+        time=torch.zeros(1, dtype=torch.float64, device=device),
+        impulse=torch.zeros(1, 4, 3, dtype=torch.float64, device=device),
+        x_residual=torch.zeros_like(state.x),
+    )
+    return step, state
+
+
+@pytest.mark.parametrize("name", [name for name in FIELDS if name != "extra"])
+def test_steps_change_the_fields_that_their_role_names(name, device):
+    step, state = step_and_state_with_all_fields(device)
+    before, after = (getattr(s, name) for s in (state, step(state, 1e-3)))
+    assert torch.equal(before, after) == (ROLES[name].changed_by is None)
+    step.heat = None
+    assert torch.equal(before, getattr(step(state, 1e-3), name)) == (ROLES[name].changed_by != "motion")
+
+
+@pytest.mark.parametrize("name", [name for name in PARTICLE_FIELDS if name not in ("scene", "ids", "material")])
+def test_gradients_pass_to_the_fields_that_their_role_names(name, device):
+    step, state = step_and_state_with_all_fields(device)
+    given = getattr(state, name).clone().requires_grad_()
+    end = step(state.replace(**{name: given}), 1e-3)
+    loss = sum(getattr(end, result).square().sum() for result in TRACKED) + 0 * given.sum()
+    (grad,) = torch.autograd.grad(loss, given)
+    assert bool(grad.any()) == ROLES[name].differentiable
+
+
+def test_every_field_has_a_role_and_is_in_the_lists_that_it_determines():
+    """All lists of fields in rollouts are derived from the roles."""
+    assert tuple(ROLES) == FIELDS
+    for name, role in ROLES.items():
+        if name == "extra":
+            continue
+        tracked = role.changed_by is not None and role.differentiable
+        assert (name in CONSTANTS) == (role.changed_by is None)
+        assert (name in TRACKED) == tracked
+        assert (name in gradient_norms.NORMED) == (tracked and name in PARTICLE_FIELDS)
+        assert (name in facts._READ) == (role.differentiable and role.changed_by != "heat")
+    assert checkpoints.CONSTANTS is memory.CONSTANTS is CONSTANTS and graph_segments.TRACKED is TRACKED
+
+
+@pytest.mark.parametrize("name", [name for name in FIELDS if name not in ("scene", "ids", "material", "time")])
+def test_rollouts_without_heat_are_differentiated_by_the_fields_that_motion_reads(name, device):
+    step, state = step_and_state_with_all_fields(device)
+    step.heat = None
+    given = state.extra["history"] if name == "extra" else getattr(state, name)
+    given = given.clone().requires_grad_()
+    state = state.replace(**{name: {"history": given} if name == "extra" else given})
+    role = ROLES[name]
+    assert facts.differentiates(step, state, 1e-3) == (role.differentiable and role.changed_by != "heat")

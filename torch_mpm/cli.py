@@ -44,7 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         message = _message(error)
         if message is None:
             raise
-        return _told(message, 130 if type(error).__name__ == "Interrupted" else 1)
+        return _report(message, 130 if type(error).__name__ == "Interrupted" else 1)
     return 0
 
 
@@ -53,7 +53,7 @@ class Terminated(KeyboardInterrupt):
 
 
 def _ended(kind: type[KeyboardInterrupt]) -> int:
-    return _told("terminated", 143) if issubclass(kind, Terminated) else _told("interrupted", 130)
+    return _report("terminated", 143) if issubclass(kind, Terminated) else _report("interrupted", 130)
 
 
 AGAIN_SECONDS = 0.01
@@ -109,11 +109,11 @@ def warnings_in_lines() -> Iterator[None]:
         warnings.formatwarning = usual
 
 
-TOLD = (
+REPORTED = (
     "SceneError", "OutputError", "DamagedFileError", "SimulationError", "Interrupted", "RenderError", "WorkerError",
     "IncompleteError", "VerifyError", "DatasetError", "MissingError", "FailedScenesError",
 )  # fmt: skip
-
+"""Errors reported by their message alone; others by their traceback."""
 
 LEAST = 2**26
 """Address space of the smallest command [bytes]."""
@@ -131,10 +131,10 @@ def _message(error: Exception) -> str | None:
     if isinstance(error, OSError) and error.strerror and error.filename is not None:
         return f"{error.filename}: {error.strerror}"
     names = {kind.__name__ for kind in type(error).__mro__}
-    return str(error) if names.intersection(TOLD) or isinstance(error, (OSError, ImportError)) else None
+    return str(error) if names.intersection(REPORTED) or isinstance(error, (OSError, ImportError)) else None
 
 
-def _told(message: str, status: int) -> int:
+def _report(message: str, status: int) -> int:
     shown = "".join(c if c.isprintable() or c in "\n\t" else ascii(c)[1:-1] for c in message)  # Errors of file names.
     print(f"torch-mpm: {shown}", file=sys.stderr)
     return status
@@ -156,7 +156,7 @@ def _parser() -> argparse.ArgumentParser:
     check.set_defaults(command=_check)
 
     info = commands.add_parser(
-        "info", help="fields, memory and run time of a scene; without a scene, properties of this installation"
+        "info", help="fields, memory, run time and plan of a scene; without a scene, properties of this installation"
     )
     _scene_arguments(info, optional=True)
     info.set_defaults(command=_info)

@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import re
 from pathlib import Path
 
 import pytest
@@ -173,6 +174,15 @@ def test_tables_of_the_documents_are_those_of_the_results() -> None:
     for document, tables in report.documents(common.RESULTS).items():
         text = document.read_text()
         assert report.insert(text, tables) == text, f"{document.name} differs: python -m benchmarks.report --write"
+
+
+def test_captions_of_the_documents_have_a_sentence_per_line() -> None:
+    for document, tables in report.documents(common.RESULTS).items():
+        captions = [line for line in tables.splitlines() if not line.startswith(("|", "- ", "#", "!"))]
+        assert captions
+        for line in filter(None, captions):
+            assert not re.search(r"[\w)\]`]\. [A-Z0-9`]", line), f"{document.name}: {line}"
+            assert line[-1] in ".:", f"{document.name}: {line}"
 
 
 def test_return_map_of_sand_against_extended_precision(tmp_path: Path) -> None:

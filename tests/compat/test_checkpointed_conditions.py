@@ -108,7 +108,7 @@ def test_a_time_that_is_given(device):
 
 
 @pytest.mark.parametrize("ends", [0.5, 999.0])
-def test_times_that_cannot_be_told_apart(ends):
+def test_times_that_cannot_be_distinguished(ends):
     """Two passes from the same tensors without `reset`: an error where a condition ends between them, and only then."""
     solver = made({**CONDITIONS["translation"], "start_time": 0.0, "end_time": ends}, "cpu")
     x, v, C, F = start("cpu")

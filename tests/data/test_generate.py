@@ -347,8 +347,8 @@ def test_a_scene_that_explodes_is_recorded_and_leaves_the_others_as_they_are(tmp
     built = made.scene(*(content(made, s.id) for s in good)).build("cpu")
     alone, failures = batch.simulate(built, ["position"], 12, 0.005, 10)
     assert failures == [""] * len(good)
-    for recorded, told in zip(alone, good, strict=True):
-        np.testing.assert_array_equal(recorded.arrays["position"], dataset.scene(told.id)["position"])
+    for recorded, listed in zip(alone, good, strict=True):
+        np.testing.assert_array_equal(recorded.arrays["position"], dataset.scene(listed.id)["position"])
     assert list(verify(tmp_path)) == []
 
 
@@ -403,17 +403,17 @@ def test_a_simulation_that_is_broken_off_leaves_no_threads(device):
 
 def test_a_scene_that_needs_too_many_steps_fails_alone(tmp_path):
     generate(configuration(material__jelly__E={"choice": [1e4, 1e20]}), tmp_path, device="cpu")
-    told = DatasetFolder(tmp_path).attempted()
-    assert {s.valid for s in told} == {True, False}
-    assert all("substeps, more than" in s.failure for s in told if not s.valid)
+    attempted = DatasetFolder(tmp_path).attempted()
+    assert {s.valid for s in attempted} == {True, False}
+    assert all("substeps, more than" in s.failure for s in attempted if not s.valid)
 
 
 def test_a_scene_without_room_is_recorded(tmp_path):
     made = configuration(body__0__count={"choice": [1, 30], "weights": [1, 8]})
     generate(made, tmp_path, device="cpu")
-    told = DatasetFolder(tmp_path).attempted()
-    assert {s.valid for s in told} == {True, False}
-    assert all("no room for body[0]" in s.failure and s.attempts == 0 for s in told if not s.valid)
+    attempted = DatasetFolder(tmp_path).attempted()
+    assert {s.valid for s in attempted} == {True, False}
+    assert all("no room for body[0]" in s.failure and s.attempts == 0 for s in attempted if not s.valid)
 
 
 def test_a_data_set_without_a_good_scene_cannot_be_finalized(tmp_path):

@@ -59,7 +59,7 @@ def test_it_learns_from_the_disk_and_online_alike(data, configuration, tmp_path,
     losses = {}
     for name, stream in streams.items():
         model = new_model(data)
-        history = example.train(model, iter(stream), 150, told=lambda _: None)
+        history = example.train(model, iter(stream), 150, report=lambda _: None)
         losses[name] = sum(history[-50:]) / 50
         assert losses[name] < 0.92 * sum(history[:5]) / 5
     assert losses["online"] == pytest.approx(losses["disk"], rel=0.1)

@@ -87,7 +87,7 @@ def test_a_good_preconditioner_saves_iterations(device):
     assert max(given.error(better.solution, b) for b in (0, 2)) < 1e-7
 
 
-def test_what_does_not_converge_is_told(device, monkeypatch):
+def test_what_does_not_converge_is_reported(device, monkeypatch):
     """Too few iterations; and a matrix that shifts a unit vector, whose residual restarts would never lessen."""
     monkeypatch.setattr(module, "DIRECTIONS", 5)
     given = problem(device)

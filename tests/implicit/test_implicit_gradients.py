@@ -208,7 +208,7 @@ def test_an_integrator_given_to_two_steps(device):
     assert steps[0].integrator.options == steps[1].integrator.options
 
 
-def test_a_solve_of_the_adjoint_that_fails_is_told(device):
+def test_a_solve_of_the_adjoint_that_fails_is_reported(device):
     """With too few iterations the gradient is NaN, not wrong."""
     grid, values = inputs(2, device)
     values["mu"].requires_grad_()

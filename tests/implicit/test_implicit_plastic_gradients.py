@@ -313,7 +313,7 @@ def test_a_bad_scene_does_not_keep_the_others_waiting(law, device, monkeypatch):
     assert relative_error(grads[1][:P], grads[0][:P]) < 1e-12
 
 
-def test_a_solve_of_the_adjoint_that_fails_is_told(device):
+def test_a_solve_of_the_adjoint_that_fails_is_reported(device):
     """With too few iterations the gradient is NaN, not wrong."""
     grid, values = inputs(LAWS[6], 2, device)
     values["E"] = (100 * values["E"]).requires_grad_()

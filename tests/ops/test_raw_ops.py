@@ -108,7 +108,7 @@ def test_the_lattice() -> None:
     refusals(taking("lattice"), changes)
 
 
-def test_expected_and_given_shapes_are_told() -> None:
+def test_expected_and_given_shapes_are_reported() -> None:
     """One row fewer in each particle or node tensor: the message has its name, the expected and the given shape.
     Images, and particles to take, may have any number."""
 

@@ -26,11 +26,11 @@ def scene(tmp_path):
 
 def test_run_prints_where_things_are_and_what_it_took(scene, tmp_path, capsys):
     assert main(["run", str(scene), "-o", str(tmp_path / "out"), "--set", "precision=float64"]) == 0
-    told = capsys.readouterr()
+    printed = capsys.readouterr()
     for text in ("3 frames", "simulation", "writing", "mass drift", "largest CFL number", "particles lost  none"):
-        assert text in told.out
-    assert str(tmp_path / "out" / "trajectory.h5") in told.out
-    assert "substeps" in told.err and "kinetic" in told.err and "elastic" in told.err  # the progress bar
+        assert text in printed.out
+    assert str(tmp_path / "out" / "trajectory.h5") in printed.out
+    assert "substeps" in printed.err and "kinetic" in printed.err and "elastic" in printed.err  # the progress bar
     with Trajectory(tmp_path / "out") as read:
         assert read.complete and read["position"].dtype == "float64"
         assert read.attributes["scene"] == scene.read_text()
@@ -60,9 +60,9 @@ def test_pictures_and_video(scene, tmp_path, capsys):
     assert [p.name for p in pictures] == ["00000.png", "00001.png", "00002.png"]
     assert (read_png(pictures[0]) != read_png(pictures[2])).any()
     assert (tmp_path / "out" / "video.mp4").read_bytes()[4:8] == b"ftyp"
-    told = [line.split() for line in capsys.readouterr().out.splitlines()]
+    printed = [line.split() for line in capsys.readouterr().out.splitlines()]
     for name, place in {"trajectory": "trajectory.h5", "pictures": "frames", "video": "video.mp4"}.items():
-        assert [name, str(tmp_path / "out" / place)] in told
+        assert [name, str(tmp_path / "out" / place)] in printed
     before = [path.read_bytes() for path in pictures]
     assert main(["render", str(tmp_path / "out"), "--set", "render.color_by=material"]) == 0
     assert capsys.readouterr().out.strip().endswith("video.mp4")
@@ -112,18 +112,20 @@ def test_check_tells_good_from_bad(scene, capsys):
     assert main(["check", str(scene)]) == 0
     assert "scene.toml: good, " in capsys.readouterr().out
     assert main(["check", str(scene), "--set", "grid.dxx=3", "--set", "body[0].material=1"]) == 1
-    told = capsys.readouterr().err.splitlines()
-    assert len(told) == 2 and told[0].startswith("torch-mpm: ")
-    assert any("scene.toml: grid.dxx: unknown key; did you mean 'dx'?" in line for line in told)
-    assert any("scene.toml: body[0].material: should be a valid string, got 1" in line for line in told)
+    printed = capsys.readouterr().err.splitlines()
+    assert len(printed) == 2 and printed[0].startswith("torch-mpm: ")
+    assert any("scene.toml: grid.dxx: unknown key; did you mean 'dx'?" in line for line in printed)
+    assert any("scene.toml: body[0].material: should be a valid string, got 1" in line for line in printed)
 
 
 def test_info_lists_what_the_scene_uses(scene, capsys):
     assert main(["info", str(scene)]) == 0
-    told = dict(line.split("  ", 1) for line in map(str.strip, capsys.readouterr().out.splitlines()))
-    assert told["fields"].strip() == "x 8, v 8, mass 4, volume 4, C 16, F 16, ids 8"
-    assert told["bytes per particle"].strip() == "64"
-    assert float(told["time step [s]"]) > 0 and float(told["estimated run time [s]"]) > 0
+    printed = dict(line.split("  ", 1) for line in map(str.strip, capsys.readouterr().out.splitlines()))
+    assert printed["fields"].strip() == "x 8, v 8, mass 4, volume 4, C 16, F 16, ids 8"
+    assert printed["bytes per particle"].strip() == "64"
+    assert float(printed["time step [s]"]) > 0 and float(printed["estimated run time [s]"]) > 0
+    assert printed["plan"].strip() == "all steps in one op (executor fused, schedule sorted_cpu)"
+    assert {"not loop", "not replay", "not graph", "not per_step", "not persistent"} < printed.keys()
     assert main(["info"]) == 0
     assert "torch:" in capsys.readouterr().out
 

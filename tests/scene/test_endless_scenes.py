@@ -36,7 +36,7 @@ def test_scenes_that_would_never_end(tmp_path, capsys, command, override, key):
     assert f"{key}:" in message and not (tmp_path / "out").exists(), message
 
 
-def test_the_number_of_substeps_is_told(tmp_path, capsys):
+def test_the_number_of_substeps_is_reported(tmp_path, capsys):
     scene = tmp_path / "scene.toml"
     scene.write_text(FILE.format(duration=0.04))
     assert main(["check", str(scene), "--set", "dt=1e-5"]) == 0
@@ -50,10 +50,10 @@ def test_the_speed_of_emitters_counts(start, share, tmp_path, capsys):
     scene.write_text(FILE.format(duration=0.04))
     emitter = f"{EMITTER}velocity=[0.0, -500.0], start={start}}}]"
     assert main(["check", str(scene), "--set", emitter]) == 0
-    told = int(re.search(r"about (\d+) substeps", capsys.readouterr().out)[1])
+    estimated = int(re.search(r"about (\d+) substeps", capsys.readouterr().out)[1])
     assert main(["run", str(scene), "--set", emitter, "-o", str(tmp_path / "out"), "--quiet"]) == 0
     taken = int(re.search(r"(\d+) substeps", capsys.readouterr().out)[1])
-    assert told <= taken <= 2 * told and told > 1000 * share
+    assert estimated <= taken <= 2 * estimated and estimated > 1000 * share
 
 
 @pytest.mark.parametrize("quiet", [False, True])

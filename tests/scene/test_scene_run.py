@@ -365,7 +365,7 @@ def test_a_frame_is_handed_over_once_the_next_substeps_have_begun(tmp_path, ahea
     assert events == [*order, 5]
 
 
-def test_a_frame_that_waits_is_told_of_as_it_was(tmp_path, monkeypatch):
+def test_a_frame_that_waits_is_reported_as_it_was(tmp_path, monkeypatch):
     """Its state and its record lack what was emitted and counted since."""
     found = []
     for waits in (True, False):
@@ -390,16 +390,16 @@ def test_the_frame_before_a_failure_is_written(tmp_path, ahead, monkeypatch, whe
         return result
 
     monkeypatch.setattr(module.Simulation, where, fails)
-    told = []
+    reported = []
     scene = Scene(**disc(device="cpu"))
     with pytest.raises(SceneFailure, match="it went wrong"):
-        scene.run(tmp_path / "out", progress=told.append)
+        scene.run(tmp_path / "out", progress=reported.append)
     with Trajectory(tmp_path / "out") as read:
         assert len(read) == 3
         substeps = int(read["substeps"][:3].sum())
     _, record = load(tmp_path / "out" / "checkpoint.h5")
     assert record["frame"] == 2 and record["totals"]["substeps"] == substeps
-    assert [figures["frame"] for figures in told] == [1, 2]
+    assert [figures["frame"] for figures in reported] == [1, 2]
 
 
 def test_threads_take_turns_soon_while_a_run_lasts(tmp_path):

@@ -15,8 +15,11 @@ pytest.importorskip("pydantic")
 
 import torch_mpm as mpm
 from torch_mpm.data.configuration import Dataset
+from torch_mpm.rollouts.plan import SCHEDULES
 from torch_mpm.scene import Scene, SceneError, json_schema, schema
+from torch_mpm.scene.describe import halfway, plan_in_words
 from torch_mpm.scene.explain import BOOLEANS
+from torch_mpm.scene.substeps import time_step
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.toml"))
 BOX = {"shape": "box", "lower": (0.1, 0.1), "upper": (0.3, 0.3), "material": "jelly"}
@@ -180,14 +183,28 @@ def test_descriptions_reach_the_schema():
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda p: p.stem)
-def test_examples_build(path):
+def test_examples_build_and_name_their_plan(path):
     scene = Scene.load(path, ["device=cpu"])
     if any(getattr(body, "shape", None) == "mesh" for body in scene.body):
         pytest.importorskip("trimesh")
     if path.stem == "demo":
-        assert scene.dim == 3 and scene.render.video and scene.build().particles >= 100_000
+        assert scene.dim == 3 and scene.render.video
+    built = scene.build()
+    assert built.particles >= (100_000 if path.stem == "demo" else 1001)
+    state = halfway(built)
+    dt, substeps = time_step(scene, built, state)
+    headline, *others = plan_in_words(scene, built, state.sorted(built.grid), dt, substeps).items()
+    executors, schedules = {"fused", "replay", "graph", "loop"}, set(SCHEDULES)
+    if scene.heat is None:
+        chosen = {"fused", "sorted_cpu"}
+        assert "(executor fused, schedule sorted_cpu)" in headline[1]
     else:
-        assert scene.build().particles > 1000
+        chosen = {"loop", *schedules}  # Schedules are those of the fused op.
+        assert headline[1].startswith("step by step, because it conducts heat (executor loop)")
+    assert headline[0] == "plan" and {name for name, _ in others} == {
+        f"not {name}" for name in (executors | schedules) - chosen
+    }
+    assert all(len(reason) > 10 for _, reason in others)
 
 
 # ---- what a scene becomes
@@ -358,7 +375,7 @@ def test_overlaps_show_beside_other_mistakes():
     assert [problem[:20] for problem in error.value.problems] == ["body[2]: reaches fro", "body[0]: overlaps bo"]
 
 
-def test_a_missing_material_is_not_told_twice():
+def test_a_missing_material_is_not_reported_twice():
     words = disc(material={"jelly": {"law": "neo_hookean", "E": 1.0, "nu": 0.7}})
     with pytest.raises(SceneError) as error:
         Scene(**words)

@@ -96,10 +96,10 @@ def check_samples(configuration: Configuration, count: int = 3) -> None:
     entries = narrowed({**configuration.words, **once})  # With bodies that few scenes have.
     found = {key: _problems(replace(configuration, words=words), 0, room=False) for key, words in entries}
     if any(found.values()):
-        raise SceneError(_told_once(found), configuration.source)
+        raise SceneError(_lines_of(found), configuration.source)
     found = {f"scene {k}": _problems(configuration, k) for k in range(min(count, configuration.scenes))}
     if all(found.values()):
-        raise SceneError(_told_once(found), configuration.source)
+        raise SceneError(_lines_of(found), configuration.source)
 
 
 def _problems(configuration: Configuration, scene_id: int, room: bool = True) -> list[str]:
@@ -113,7 +113,7 @@ def _problems(configuration: Configuration, scene_id: int, room: bool = True) ->
         return error.problems
 
 
-def _told_once(found: Mapping[str, Sequence[str]]) -> list[str]:
+def _lines_of(found: Mapping[str, Sequence[str]]) -> list[str]:
     """Lines for the problems of several scenes: one line for a common problem, otherwise one per scene."""
     lines: dict[str, None] = {}
     for place, problems in found.items():

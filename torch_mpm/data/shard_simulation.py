@@ -187,14 +187,14 @@ def _attempt(
     dataset, statics = configuration.dataset, built.statics()
     names = ("position", *dataset.fields)
 
-    def frame_told(frame: int) -> None:
+    def report_frame(frame: int) -> None:
         if on_frame is not None:
             on_frame(len(outcomes), frame)
 
     packed, behind = [packers is not None] * len(outcomes), [o.behind for o in outcomes]
     try:
         stored, failures = batch.simulate(
-            built, names, dataset.frames, dataset.interval, count, frame_told, packers, packed, behind
+            built, names, dataset.frames, dataset.interval, count, report_frame, packers, packed, behind
         )
     except torch.OutOfMemoryError as error:
         raise SimulationError(

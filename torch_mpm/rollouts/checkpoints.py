@@ -16,15 +16,12 @@ from torch.utils import _pytree
 from ..boundaries.control import motions_of
 from ..errors import check_count, check_flag, check_number
 from ..grid.grid import same_pools
-from ..state.state import State
+from ..state.state import CONSTANTS, State
 from ..step.status import aside, uncounted
 from .recompute import called_again
 
 Advance = Callable[[State, int, int], State]
 """Function of (state, count, k) that returns the state `count` steps later; the first of them is step k."""
-
-CONSTANT = ("mass", "volume", "scene", "ids", "material")
-"""Fields that steps do not change."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -237,7 +234,7 @@ def offloaded(state: State) -> Iterator[None]:
     Fields that steps do not change stay on the device, since all stored states share them. Copies are queued on the
     stream.
     """
-    shared = {t.untyped_storage().data_ptr() for name in CONSTANT if (t := getattr(state, name)) is not None}
+    shared = {t.untyped_storage().data_ptr() for name in CONSTANTS if (t := getattr(state, name)) is not None}
     P = len(state)
 
     def pack(t: Tensor) -> tuple[torch.device, Tensor]:

@@ -16,7 +16,7 @@ from ..laws.active import Active
 from ..laws.calls import laws_of, passive
 from ..laws.parameters import tensors_in
 from ..ops.obstacle_tables import numbers_of_a_step, path_requires_grad
-from ..state.state import State
+from ..state.state import ROLES, State
 from ..step.clocks import StepTimes, requires_grad
 from ..step.step import Step
 from .steps import Steps
@@ -151,19 +151,15 @@ def _obstacles(step: Step) -> list[Obstacle]:
     return [b for b in step.boundaries.entries if isinstance(b, Obstacle)]
 
 
+_READ = tuple(
+    name for name, role in ROLES.items() if role.differentiable and role.changed_by != "heat" and name != "extra"
+)
+"""Differentiable fields that the fused op reads, beside history. It conducts no heat."""
+
+
 def _differentiable(step: Step, state: State) -> list[Tensor]:
     """Tensors that the fused op is differentiable by."""
-    fields = (
-        state.x,
-        state.v,
-        state.mass,
-        state.volume,
-        state.C,
-        state.F,
-        state.J,
-        *state.extra.values(),
-        state.impulse,
-    )
+    fields = (*(getattr(state, name) for name in _READ), *state.extra.values())
     gravity = [step.gravity] if isinstance(step.gravity, Tensor) else []
     obstacles = [t for b in _obstacles(step) for t in motion_tensors(b)]
     return [*(t for t in fields if t is not None), *gravity, *tensors_in(step.law), *obstacles]

@@ -11,10 +11,10 @@ from torch import Tensor
 
 from ..errors import check_count, check_number
 from ..ops.arguments import sum_by_scene
-from ..state.state import State
+from ..state.state import PARTICLE_FIELDS, TRACKED, State
 
-MOVED = ("x", "v", "C", "F", "J", "temperature")
-"""Fields that steps change, beside history."""
+NORMED = tuple(name for name in TRACKED if name in PARTICLE_FIELDS)
+"""Fields with a norm, beside history."""
 
 
 class GradientNorms:
@@ -86,7 +86,7 @@ class GradientNorms:
             t.register_hook(store_norm)
             return t
 
-        changes = {name: watch(name, t) for name in MOVED if (t := getattr(state, name)) is not None}
+        changes = {name: watch(name, t) for name in NORMED if (t := getattr(state, name)) is not None}
         history = {name: t if t.is_leaf else watch(name, t) for name, t in state.extra.items()}
         return state.replace(**changes, extra=history)
 

@@ -19,7 +19,7 @@ from ..errors import check_count, shape_of
 from ..grid.grid import own_pools
 from ..laws.mixture import Mixture
 from ..laws.parameters import has_hooks
-from ..state.state import EXTRA, State, check_state, tensors_of
+from ..state.state import EXTRA, TRACKED, State, check_state, tensors_of
 from ..step.clocks import time_after
 from ..step.status import counts_of, uncounted
 from ..step.step import Step
@@ -189,7 +189,7 @@ class GraphedStep:
         fixed = {name: self._graphs.same_content(name, inputs.pop(name)) for name in known.by_content(prepared)}
         wanted = {name for name, t in inputs.items() if torch.is_grad_enabled() and t.requires_grad}
         if alike and wanted:
-            wanted |= {name for name, t in inputs.items() if name in _MOVED or name.startswith(EXTRA)}
+            wanted |= {name for name, t in inputs.items() if name in TRACKED or name.startswith(EXTRA)}
             wanted = {name for name in wanted if inputs[name].is_floating_point()}
         kinds = frozenset((name, t.shape, t.dtype, t.device, name in wanted) for name, t in inputs.items())
         contents = tuple((name, Same(t)) for name, t in fixed.items())
@@ -203,10 +203,6 @@ class GraphedStep:
             known.refresh()
             self._graphs.keep((kinds, around, known.key, known.pools()), captured)
         return captured, [inputs[name] for name in captured.steps.names]
-
-
-_MOVED = ("x", "v", "C", "F", "J", "temperature", "impulse")
-"""Fields that steps change, and that have gradients."""
 
 
 def _with(state: State, tensors: Mapping[str, Any]) -> State:

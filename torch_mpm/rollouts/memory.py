@@ -10,16 +10,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..state.state import State
+from ..state.state import CONSTANTS, State
 from ..step.status import aside
-from .checkpoints import CONSTANT
 
 StepFunction = Callable[[State, "float | Tensor"], State]
 
 
 def state_bytes(state: State) -> int:
     """Size of the tensors that steps change [bytes]."""
-    fields = [getattr(state, f.name) for f in dataclasses.fields(state) if f.name not in (*CONSTANT, "extra")]
+    fields = [getattr(state, f.name) for f in dataclasses.fields(state) if f.name not in (*CONSTANTS, "extra")]
     return sum(_bytes(t) for t in [*fields, *state.extra.values()] if isinstance(t, Tensor))
 
 
@@ -29,7 +28,7 @@ def step_bytes(step: StepFunction, state: State, dt: float | Tensor) -> int:
     """
     start = differentiable(state)
     parameters = [*step.parameters(), *step.buffers()] if isinstance(step, torch.nn.Module) else []
-    constants = [t for name in CONSTANT if (t := getattr(start, name)) is not None]
+    constants = [t for name in CONSTANTS if (t := getattr(start, name)) is not None]
     known = {t.untyped_storage().data_ptr() for t in [*constants, *parameters]}
     kept: dict[int, int] = {}
 

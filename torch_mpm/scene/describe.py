@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..state.state import PARTICLE_FIELDS, State
 from .build import Built
-from .run import Simulation, joined
+from .run import LONGEST_SEGMENT, Simulation, joined
 from .scene import Scene
 from .substeps import check_substeps, time_step
 
@@ -19,13 +19,14 @@ TRIAL_STEPS = 3
 
 
 def describe(scene: Scene, built: Built) -> dict[str, Any]:
-    """Fields in use with their bytes per particle, estimated time step and run time, and size of the trajectory.
+    """Fields in use with their bytes per particle, estimated time step and run time, size of the trajectory, and the
+    plan of the substeps: executor, schedule and the reason against each of the others.
 
     The run time is that of a few substeps with half of the emitted particles, times the number of substeps for the
     stability limit of the first state.
     """
     check_substeps(scene, built)
-    state = _halfway(built)
+    state = halfway(built)
     dt, substeps = time_step(scene, built, state)
     after, seconds = _trial(built, state, dt)
     materials = {m.name: m.words.law for m in built.materials}
@@ -48,10 +49,26 @@ def describe(scene: Scene, built: Built) -> dict[str, Any]:
         "substeps": round(substeps),
         "estimated run time [s]": seconds * substeps,
         "trajectory [MB]": Simulation(scene, built).layout("", "").bytes / 1e6,
+        **plan_in_words(scene, built, after, dt, substeps),
     }
 
 
-def _halfway(built: Built) -> State:
+@torch.no_grad()
+def plan_in_words(scene: Scene, built: Built, state: State, dt: float, substeps: float) -> dict[str, str]:
+    """`Step.explain` for the longest rollout of a run: "plan" with executor and schedule, and "not NAME" with the
+    reason against each other executor and schedule.
+
+    Args:
+        state: sorted particles.
+        dt: time step [s].
+        substeps: number of substeps of the scene.
+    """
+    steps = min(math.ceil(substeps / max(scene.frames, 1)), LONGEST_SEGMENT[state.x.device.type])
+    plan, *others = built.step.explain(state, dt, n=steps).splitlines()
+    return {"plan": plan, **dict(line.split(": ", 1) for line in others)}
+
+
+def halfway(built: Built) -> State:
     """First state and half of the emitted particles, at the positions of their emission."""
     state = built.state
     for nozzle in built.nozzles:

@@ -49,8 +49,8 @@ def _check_dt(scene: Scene, built: Built, state: State) -> None:
     limit = min(limits)
     if scene.dt > limit:
         name = built.scenes[limits.index(limit)]
-        told = f"{scene.dt:g} s is above the stability limit {limit:.3g} s{f' of {name}' if name else ''}"
-        raise SceneError([f"dt: {told}; use {0.5 * limit:.2g}, or remove dt and set cfl = 0.5"], scene.source)
+        problem = f"{scene.dt:g} s is above the stability limit {limit:.3g} s{f' of {name}' if name else ''}"
+        raise SceneError([f"dt: {problem}; use {0.5 * limit:.2g}, or remove dt and set cfl = 0.5"], scene.source)
 
 
 def time_step(scene: Scene, built: Built, state: State) -> tuple[float, float]:

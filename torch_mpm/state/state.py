@@ -7,7 +7,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -463,6 +463,33 @@ FIELDS = tuple(f.name for f in dataclasses.fields(State))
 PARTICLE_FIELDS = tuple(name for name in FIELDS if name not in ("extra", "time", "impulse"))
 """Fields with a row per particle, beside those in `extra`."""
 _NAMES = frozenset(FIELDS)
+
+
+class Role(NamedTuple):
+    """Role of a field in a step.
+
+    Attributes:
+        changed_by: part of a step that changes the field; None for a constant.
+        differentiable: whether a step passes gradients to the field. The time has those of dt, see `step.clocks`.
+    """
+
+    changed_by: Literal["motion", "heat"] | None
+    differentiable: bool
+
+
+_ROLES = {
+    **dict.fromkeys(("x", "v", "C", "F", "J", "impulse", "extra"), Role("motion", True)),
+    **dict.fromkeys(("temperature",), Role("heat", True)),
+    **dict.fromkeys(("x_residual", "time"), Role("motion", False)),
+    **dict.fromkeys(("mass", "volume"), Role(None, True)),
+    **dict.fromkeys(("scene", "ids", "material"), Role(None, False)),
+}
+ROLES = {name: _ROLES[name] for name in FIELDS}
+"""Role of each field. Lists of fields for gradients, checkpoints and graphs are derived from it."""
+CONSTANTS = tuple(name for name, role in ROLES.items() if role.changed_by is None)
+"""Fields that steps do not change."""
+TRACKED = tuple(name for name, role in ROLES.items() if role.changed_by and role.differentiable and name != "extra")
+"""Fields that steps change and pass gradients to, beside those in `extra`."""
 _SYMBOLS = {
     **dict.fromkeys(("mass", "volume", "J", "temperature"), "[P]"),
     **dict.fromkeys(("v", "x_residual"), "[P, D]"),

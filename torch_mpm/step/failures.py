@@ -48,7 +48,7 @@ class Problem:
     size: Tensor | None = None
     size_in_words: str = ""
 
-    def told(self, others: Sequence[bool]) -> str:
+    def sentence(self, others: Sequence[bool]) -> str:
         """Sentence about the affected scenes, except `others`; "" for none. Synchronises."""
         counts = self.count.tolist()
         scenes = [b for b, count in enumerate(counts) if count and not others[b]]
@@ -107,7 +107,7 @@ class Failures:
         others = list(explained)
         for kind, problem in sorted(self.problems.items(), key=lambda item: item[0] in CONSEQUENCES):
             without = others if kind in CONSEQUENCES else explained if kind == LOST else [False] * len(others)
-            sentence = problem.told(without)
+            sentence = problem.sentence(without)
             if sentence:
                 sentences.append(sentence)
                 others = [a or count > 0 for a, count in zip(others, problem.count.tolist(), strict=True)]
@@ -123,7 +123,7 @@ class Failures:
                 fine = [a and count == 0 for a, count in zip(fine, self.problems[kind].count.tolist(), strict=True)]
         sentences, explained = list[str](), [False] * len(fine)
         for problem in self.given.values():
-            if sentence := problem.told(fine):
+            if sentence := problem.sentence(fine):
                 sentences.append(sentence)
                 counts = problem.count.tolist()
                 explained = [a or (count > 0 and not b) for a, count, b in zip(explained, counts, fine, strict=True)]
