@@ -235,6 +235,7 @@ class _Calls:
             ("law_figures", figures),
             ("plan_substeps", (-1, *facts)),
             ("latest_schedule", (self.x,)),
+            ("segment_clock", (self.uniform(2, 8).double(), self.uniform(2).double(), 0.5, 1.0, 100, True, 4)),
             ("survey", (*look, *self.obstacles, self.uniform(2).double(), 0.1, *self.lattice.packed)),
         ]
 

@@ -1,6 +1,7 @@
 #pragma once
 
 #include <string>
+#include <tuple>
 
 #include "grid/topology.op.h"
 #include "laws/law.op.h"
@@ -242,6 +243,15 @@ void set_history(LawArguments<T, D>& a, const LawCall& call, const Field<const T
     a.history[k] = variable<const T, D>(history, first, matrix);
     first += matrix ? D * D : 1;
   }
+}
+
+// The results of a call: x, v, C, F, J, history, status, impulse, time, residual, and the record.
+using Results = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
+
+inline Tensor copy_of(const Tensor& t) {
+  Tensor copy = empty(t, sizes_of(t));
+  torch::stable::copy_(copy, t);
+  return copy;
 }
 
 }  // namespace mpm

@@ -4,9 +4,7 @@
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
 #include "rollout/schedules/sorted_cpu.op.h"
 #else
-#include "rollout/schedules/block_per_scene.op.h"
-#include "rollout/schedules/fused_g2p2g.op.h"
-#include "rollout/schedules/persistent.op.h"
+#include "rollout/schedules/cuda_call.op.h"
 #endif
 
 // n steps of a simulation in one call.
@@ -14,14 +12,6 @@ namespace mpm {
 namespace {
 
 thread_local int64_t schedule_of_latest = kChoose;  // of this backend
-
-Tensor copy_of(const Tensor& t) {
-  Tensor copy = empty(t, sizes_of(t));
-  torch::stable::copy_(copy, t);
-  return copy;
-}
-
-using Results = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
 // Computes the steps with a record of the inputs of the adjoint. Empty if the pool has no room: then the steps are
 // repeated without a record, and the status reports the activation.
@@ -119,6 +109,17 @@ Results run_steps(const SubstepsInputs& in, backend::Stream stream) {
           Tensor()};
 }
 
+#else
+
+template <class T, int D>
+Results run_steps(const SubstepsInputs& in, backend::Stream stream) {
+  CudaCall<T, D> call(in, stream);
+  schedule_of_latest = call.schedule();
+  call.run();
+  schedule_of_latest = call.schedule();
+  return call.results();
+}
+
 #endif
 
 Results run(const SubstepsInputs& in) {
@@ -130,131 +131,9 @@ Results run(const SubstepsInputs& in) {
     dispatch(x, [&]<class T, int D>() { recorded = run_recorded<T, D>(in, device.stream()); });
     if (recorded) return *recorded;
   }
-#if MPM_BACKEND == MPM_BACKEND_IS_cpu
   Results results;
   dispatch(x, [&]<class T, int D>() { results = run_steps<T, D>(in, device.stream()); });
   return results;
-#else
-  const int64_t P = x.size(0), D_ = x.size(1), n = in.n;
-  Tensor x_[] = {empty_particles(x, {P, D_}), Tensor()};
-  Tensor F_[] = {result(x, has(in.F), {P, D_, D_}), Tensor()};
-  Tensor J_[] = {result(x, has(in.J), {P}), Tensor()};
-  Tensor v_ = empty_particles(x, {P, D_}), C_ = result(x, in.wants_C, {P, D_, D_}), history_;
-  Tensor residual_ = result(x, has(in.residual), {P, D_});  // read by G2P only
-  Tensor status[] = {empty_int(x, {1 + in.scenes, kStatusSize}), empty_int(x, {1 + in.scenes, kStatusSize})};
-  Tensor impulse_, time_;
-  int last = 0;  // index of the buffer with the results of the last step
-  const auto start_in_results = [&] {
-    torch::stable::copy_(x_[0], x);
-    torch::stable::copy_(v_, in.v);
-    if (has(in.F)) torch::stable::copy_(F_[0], *in.F);
-    if (has(in.J)) torch::stable::copy_(J_[0], *in.J);
-    if (has(in.residual)) torch::stable::copy_(residual_, *in.residual);
-    if (in.wants_C) has(in.C) ? torch::stable::copy_(C_, *in.C) : torch::stable::zero_(C_);
-  };
-  dispatch(x, [&]<class T, int D>() {
-    const backend::Stream stream = device.stream();
-    Substeps<T, D> s(in);
-    history_ = packed_history(x, in.history, s.columns);
-    const int* before = s.previous_status;
-
-    Particles<const T> from = given_particles<T, D>(in, history_);
-    const auto buffers = [&](int k) -> Particles<T> {
-      return {field<T>(x_[k]), field<T>(v_),        field<T>(C_),      field<T>(F_[k]),
-              field<T>(J_[k]), field<T>(residual_), field<T>(history_)};
-    };
-    if (has(in.impulse)) {
-      impulse_ = copy_of(*in.impulse);
-      s.add_impulses_to(impulse_);
-    }
-    if (has(in.scene_time)) {
-      time_ = copy_of(*in.scene_time);
-      s.count_scene_times(time_);
-    }
-    s.facts.captured = is_captured(stream);
-    s.facts.graph_loops = !loops_are_refused;
-    const Schedule schedule = schedule_of(in.schedule, s.facts);
-    schedule_of_latest = schedule;
-    if (schedule == kBlockPerScene) {
-      start_in_results();
-      s.forget_stress();
-      s.make_pool(stream);
-      const Particles<T> in_place = buffers(0);
-      s.read(constant(in_place), in_place.F);
-      s.write(in_place);
-      // The last substep has its own activation, whose status counts the blocks at the end.
-      int* const activated = static_cast<int*>(status[1].data_ptr());
-      int* const now = static_cast<int*>(status[0].data_ptr());
-      double last_time = in.time;
-      for (int64_t k = 1; k < n; k++) last_time += in.dt;
-      s.activate(before, activated, stream);
-      run_scenes(s, n - 1, 0, in.time, activated, now, stream);
-      s.activate(now, activated, stream);
-      run_scenes(s, 1, n - 1, last_time, activated, now, stream);
-      after_substeps(P, n, stream);
-      return;
-    }
-    if (n > 1) s.let_activations_last(stream);
-    s.fuse(false);
-    s.make_pool(stream);
-    s.count_time(before, stream);
-    if (schedule == kFusedG2P2G) return FusedG2P2G<T, D>(s, buffers(0), status, stream).run(from, before);
-    const bool late = s.moves_late();  // then F and J are updated in place
-    x_[1] = result(x, n > 1, {P, D});
-    F_[1] = late ? F_[0] : result(x, has(in.F) && (n > 1 || s.plastic), {P, D, D});
-    J_[1] = late ? J_[0] : result(x, has(in.J) && n > 1, {P});
-    if (s.plastic && has(in.F) && !late) {  // laws change it in place
-      torch::stable::copy_(F_[1], *in.F);
-      from.F = field<const T>(F_[1]);
-    }
-    bool first = true;
-    // One substep from one of the two buffers into the other.
-    const auto substep = [&](int into, bool last, backend::Stream on) {
-      int* const now = static_cast<int*>(status[into].data_ptr());
-      s.swap_buffers(into, last);
-      s.read(from, field<T>(F_[1 - into]));
-      const Particles<T> to = buffers(into);
-      s.write(to);
-      if (late) s.move_late(to, !first, last);
-      s.activate(before, now, on);
-      s.move(on);
-      before = now;
-      first = false;
-      // The next substep reads these results.
-      from = constant(to);
-    };
-    int64_t step = 0;
-#if CUDART_VERSION >= 13000
-    if (schedule == kPersistent) {
-      s.activation.most_of_item = persistent_item<D>(in.x.size(0));
-      substep(0, false, stream);
-      const Particles<T> in_place = buffers(0);
-      s.read(from, in_place.F);
-      s.write(in_place);
-      s.move_late(in_place, true, false);
-      step = 1;
-      if (run_persistent(s, static_cast<int*>(status[1].data_ptr()), static_cast<int*>(status[0].data_ptr()), stream)) {
-        substep(last = 1, true, stream);
-        after_substeps(P, n, stream);
-        return;
-      }
-      if (in.schedule == kChoose) schedule_of_latest = kPerStep;  // for the remaining substeps
-      s.facts.graph_loops = !loops_are_refused;
-      schedule_of(in.schedule, s.facts);  // an error if it was requested
-    }
-#endif
-    while (step < n) {
-      last = int(step % 2);
-      substep(last, step + 1 == n, stream);
-      after_substeps(P, 1, stream);
-      if (++step == 2) {
-        const auto two = [&](backend::Stream on) { substep(0, false, on), substep(1, false, on); };
-        step += 2 * replay((n - step - 1) / 2, stream, two, [&] { after_substeps(P, 2, stream); });
-      }
-    }
-  });
-  return {x_[last], v_, C_, F_[last], J_[last], history_, status[last], impulse_, time_, residual_, Tensor()};
-#endif
 }
 
 Results substeps(MPM_SUBSTEPS_PARAMETERS) { return run(SubstepsInputs{MPM_SUBSTEPS_ARGUMENTS}); }

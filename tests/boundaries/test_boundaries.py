@@ -11,7 +11,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 import torch_mpm as mpm
 from torch_mpm import boundaries
-from torch_mpm.boundaries import Obstacle, constraints
+from torch_mpm.boundaries import Obstacle, constraints, motion
 
 ANGLE = {2: 0.7, 3: (0.4, -0.3, 0.8)}
 SPIN = {2: -1.3, 3: (0.5, 1.1, -0.7)}
@@ -397,6 +397,7 @@ def moving_shapes(dim: int, **options: object) -> list[Obstacle]:
 
 def test_nothing_synchronises(dim, monkeypatch):
     monkeypatch.setattr(constraints, "reads_values", lambda x: False)  # as on a GPU
+    monkeypatch.setattr(motion, "is_readable", lambda x: False)
     positions, velocity = cloud(dim)
     time = torch.tensor(0.3, dtype=torch.float64)
     scene = (torch.arange(len(positions)) % 2).int()

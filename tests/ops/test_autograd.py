@@ -175,7 +175,7 @@ LAW_OPS = (
     *("quartic_energy", "quartic_stress", "quartic_return_map"),
 )
 NO_GRADIENT = {
-    *("survey", "law_figures", "pointwise_second", "take"),
+    *("survey", "law_figures", "segment_clock", "pointwise_second", "take"),
     *("law_stiffness", "law_wave_modulus", "law_update_double_backward", "law_energy_double_backward"),
     *("heat_stencil", "heat_patches"),
     *("law_tangent", "implicit_apply", "implicit_node_blocks", "implicit_cg"),  # they refuse: see the adjoint of a step

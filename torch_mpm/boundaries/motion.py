@@ -166,7 +166,7 @@ class RigidMotion(SceneParameters):
         return vector_at("position", self.motion.position, time)
 
     def _checked_path(self, times: Tensor, centre: Tensor, like: Tensor) -> Tensor:
-        """Result of a function of time. NaN is an error where values can be read: a body that is nowhere touches nothing."""
+        """Result of a function of time. NaN is an error where it can be read: such a body would touch nothing."""
         if like.dim() == 2 and centre.shape[-1] != like.shape[1]:
             expected = f"[{like.shape[1]}] or [B, {like.shape[1]}]"
             raise ValueError(f"position must return {expected} at a time, got {list(centre.shape[times.dim() :])}")

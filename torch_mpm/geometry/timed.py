@@ -78,6 +78,6 @@ def _as_vector(name: str, value: Any, time: Tensor) -> Tensor:
         value = torch.tensor(value, dtype=torch.float64, device="cpu").to(time.device, non_blocking=True)
     if value.is_complex() or value.dtype == torch.bool:
         raise TypeError(f"{name} must return real numbers at a time, got {value.dtype}")
-    if value.dim() == 0:
-        raise ValueError(f"{name} must return [D] or [B, D] at a time, got []")
+    if value.dim() not in (1, 2):
+        raise ValueError(f"{name} must return [D] or [B, D] at a time, got {list(value.shape)}")
     return value
