@@ -169,17 +169,15 @@ MPM_HD_CALL void find_surfaces(bool wanted, const SlotPoses<T, D>& poses, const 
 
 // ---- any node
 
-// `Poses` is SlotPoses, or has its members a, s and [].
-template <class Poses, class T, int D>
-MPM_HD NodeTouch<T, D> touch_of_node(const Poses& poses, const Vector<T, D>& position) {
+template <class T, int D>
+MPM_HD NodeTouch<T, D> touch_of_node(const SlotPoses<T, D>& poses, const Vector<T, D>& position) {
   if (poses.s.near == 0) return {};
   NearestSurface<T, D> nearest(poses.a, position);
-  uint64_t left = poses.s.touching, others = poses.s.near & ~poses.s.touching;
-  while (left) {
-    nearest(lowest_bit(left), poses[lowest_bit(left)]);
-    left &= left - 1;
-    if (!left && nearest.is_inside()) left = others, others = 0;
-  }
+  const auto visit = [&](uint64_t obstacles) {
+    for (uint64_t left = obstacles; left; left &= left - 1) nearest(lowest_bit(left), poses[lowest_bit(left)]);
+  };
+  visit(poses.s.touching);
+  if (nearest.is_inside()) visit(poses.s.near & ~poses.s.touching);
   return nearest.found(poses.s.walled);
 }
 
@@ -283,19 +281,12 @@ MPM_HD Vector<T, D> after_contact(const SlotPoses<T, D>& poses, const NodeTouch<
 }
 
 // Of a node whose thread looks at it alone: the slot and its touch are found in one loop over the obstacles.
-template <class T, int D, class PoseOf>
-MPM_HD NodeTouch<T, D> lone_touch_of(const ContactArguments<T, D>& a, int scene, const int (&corner)[D], int local,
-                                     PoseOf&& pose_of) {
-  NearestSurface<T, D> nearest(a, node_position(a, corner, local));
-  const ContactSlot<T, D> slot = contact_slot_of(a, scene, corner, pose_of, nearest);
-  if (!slot.near) return {};
-  return nearest.found(slot.walled);
-}
-
 template <class T, int D>
 MPM_HD NodeTouch<T, D> lone_touch(const ContactArguments<T, D>& a, int scene, const int (&corner)[D], int local) {
-  const auto pose_of = [&](int k, const ObstacleRow<T, D>& row) { return obstacle_pose(a, a.kind[k], row, scene); };
-  return lone_touch_of(a, scene, corner, local, pose_of);
+  NearestSurface<T, D> nearest(a, node_position(a, corner, local));
+  const ContactSlot<T, D> slot = contact_slot(a, scene, corner, nearest);
+  if (!slot.near) return {};
+  return nearest.found(slot.walled);
 }
 
 template <class T, int D>

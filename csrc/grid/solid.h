@@ -79,17 +79,13 @@ struct NoVisit {
   MPM_HD void operator()(int, const Pose&) const {}
 };
 
-// The ball around the nodes of a block, moved within the walls.
-template <class T, int D>
-struct SlotBall {
-  Vector<T, D> middle;
-  T radius, margin;  // that beyond which obstacles are not near [m]
-};
-
-// Of an active block of a scene, with the lattice index of its first node; without obstacles.
-template <class T, int D>
-MPM_HD ContactSlot<T, D> slot_alone(const ContactArguments<T, D>& a, int scene, const int (&corner)[D],
-                                    SlotBall<T, D>& ball) {
+// Of an active block of a scene, with the lattice index of its first node. Calls visit(k, pose) for each obstacle that
+// is near: that may touch a node of the block or, beside others, have faces within reach of one. Distances change by no
+// more than the way from a point to another; samples of distances do so between the nodes of their lattice, so that the
+// slope of their multilinear interpolant is at most 1 along each axis.
+template <class T, int D, class Visit = NoVisit>
+MPM_HD ContactSlot<T, D> contact_slot(const ContactArguments<T, D>& a, int scene, const int (&corner)[D],
+                                      Visit&& visit = {}) {
   ContactSlot<T, D> s;
   s.scene = scene;
   s.active = (a.rows == 1 || scene < a.rows) && (!a.scene_time || a.times == 1 || scene < a.times);
@@ -99,56 +95,26 @@ MPM_HD ContactSlot<T, D> slot_alone(const ContactArguments<T, D>& a, int scene, 
     s.corner[i] = corner[i];
   if (!s.active) return s;
   const T half = T(0.5 * (kBlockWidth - 1) * a.dx);
-  ball.middle = node_position(a, s.corner, 0);
+  Vector<T, D> middle = node_position(a, s.corner, 0), sign;
   MPM_UNROLL for (int i = 0; i < D; i++)
-    ball.middle[i] = ball.middle[i] + half;
-  s.walled = nearest_wall(a, ball.middle) <= half + T(kReach * a.dx);
-  Vector<T, D> sign;
-  if (s.walled) ball.middle = within_walls(a, ball.middle, T(0), sign);
-  ball.radius = std::sqrt(T(D)) * half * T(1.001) + (s.walled ? T(kSeam * a.dx) : T(0));
-  ball.margin = a.obstacles > 1 ? T((kReach + kSeam) * a.dx) : T(0);
-  return s;
-}
-
-// Whether an obstacle is near a block: may touch a node of it or, beside others, have faces within reach of one; and
-// whether it may touch one. Distances change by no more than the way from a point to another; samples of distances do
-// so between the nodes of their lattice, so that the slope of their multilinear interpolant is at most 1 along each
-// axis.
-enum class Nearness { far, near, touching };
-
-template <class T, int D>
-MPM_HD Nearness nearness(const ContactArguments<T, D>& a, const SlotBall<T, D>& ball, const ObstaclePose<T, D>& pose) {
-  Vector<T, D> normal;
-  const T slope = pose.shape == ObstacleShape::sampled ? std::sqrt(T(D)) : T(1);
-  const T way = surface(pose, to_body(pose, ball.middle), normal) - a.rounding;
-  if (way <= slope * ball.radius) return Nearness::touching;
-  return way <= slope * (ball.radius + ball.margin) ? Nearness::near : Nearness::far;
-}
-
-// The slot of an active block. Calls visit(k, pose) for each obstacle that is near; `pose_of(k, row)` is its pose.
-template <class T, int D, class PoseOf, class Visit = NoVisit>
-MPM_HD ContactSlot<T, D> contact_slot_of(const ContactArguments<T, D>& a, int scene, const int (&corner)[D],
-                                         PoseOf&& pose_of, Visit&& visit = {}) {
-  SlotBall<T, D> ball;
-  ContactSlot<T, D> s = slot_alone(a, scene, corner, ball);
-  for (int k = 0; s.active && k < a.obstacles; k++) {
-    const auto& pose = pose_of(k, s.row[k]);
+    middle[i] = middle[i] + half;
+  s.walled = nearest_wall(a, middle) <= half + T(kReach * a.dx);
+  if (s.walled) middle = within_walls(a, middle, T(0), sign);
+  const T radius = std::sqrt(T(D)) * half * T(1.001) + (s.walled ? T(kSeam * a.dx) : T(0));
+  const T margin = a.obstacles > 1 ? T((kReach + kSeam) * a.dx) : T(0);
+  for (int k = 0; k < a.obstacles; k++) {
+    const ObstaclePose<T, D> pose = obstacle_pose(a, a.kind[k], s.row[k], scene);
     if (!pose.acts) continue;
-    const Nearness found = nearness(a, ball, pose);
-    if (found == Nearness::far) continue;
+    Vector<T, D> normal;
+    const T slope = pose.shape == ObstacleShape::sampled ? std::sqrt(T(D)) : T(1);
+    const T way = surface(pose, to_body(pose, middle), normal) - a.rounding;
+    if (!(way <= slope * (radius + margin))) continue;
     s.near |= uint64_t(1) << k;
-    if (found == Nearness::touching) s.touching |= uint64_t(1) << k;
+    if (way <= slope * radius) s.touching |= uint64_t(1) << k;
     visit(k, pose);
   }
   if (!s.touching) s.near = 0;
   return s;
-}
-
-template <class T, int D, class Visit = NoVisit>
-MPM_HD ContactSlot<T, D> contact_slot(const ContactArguments<T, D>& a, int scene, const int (&corner)[D],
-                                      Visit&& visit = {}) {
-  const auto pose_of = [&](int k, const ObstacleRow<T, D>& row) { return obstacle_pose(a, a.kind[k], row, scene); };
-  return contact_slot_of(a, scene, corner, pose_of, visit);
 }
 
 template <class T, int D, class Visit = NoVisit>

@@ -58,13 +58,6 @@ struct SceneState {
   int more_room;
 };
 
-// Poses of the first obstacles of a scene in a substep, computed once for all its nodes.
-template <class T, int D>
-struct KnownPoses {
-  static constexpr int most = 8;
-  ObstaclePose<T, D> pose[most];
-};
-
 // Contact of the nodes of a scene that meet several surfaces, from their velocities before it. Called by all threads.
 template <class T, int D>
 __device__ __noinline__ void add_contact(const GridUpdateArguments<T, D>& update, const ContactArguments<T, D>& contact,
@@ -102,7 +95,6 @@ class SceneStep {
   Blocks blocks;
   GridUpdateArguments<T, D>& update;  // with the blocks of this scene
   ContactArguments<T, D>& contact;
-  KnownPoses<T, D>& known_poses;
 
   __device__ const Topology<T, D>& topology() const { return source.topology; }
   __device__ const Geometry<T, D>& geometry() const { return source.topology.geometry; }
@@ -475,23 +467,10 @@ class SceneStep {
       walk_columns();
   }
 
-  __device__ void find_poses() const {
-    const ObstacleRow<T, D>* const row = contact.row + (contact.rows == 1 ? 0 : int64_t(scene) * contact.obstacles);
-    const int k = threadIdx.x;
-    if (k < contact.obstacles && k < KnownPoses<T, D>::most)
-      known_poses.pose[k] = obstacle_pose(contact, contact.kind[k], row[k], scene);
-    __syncthreads();
-  }
-  __device__ ObstaclePose<T, D> pose_of(int k, const ObstacleRow<T, D>& row) const {
-    if (k < KnownPoses<T, D>::most) return known_poses.pose[k];
-    return obstacle_pose(contact, contact.kind[k], row, scene);
-  }
-
   // Returns, to all threads, whether a node meets several surfaces; it has its velocity before contact then.
   template <bool Obstacles>
   __device__ bool update_nodes() const {
     bool several = false;
-    if constexpr (Obstacles) find_poses();
 #pragma unroll 1
     for (int i = threadIdx.x; i < state.blocks * count; i += blockDim.x) {
       const int slot = i / count, local = i % count;
@@ -504,9 +483,7 @@ class SceneStep {
       const SlotUpdate<T, D> there = slot_update(update, slot);
       NodeRow<T, D> row = update_node(update, there, local, node);
       if constexpr (Obstacles) {
-        const NodeTouch<T, D> touch =
-            lone_touch_of(contact, there.scene, there.corner, local,
-                          [&](int k, const ObstacleRow<T, D>& row) { return pose_of(k, row); });
+        const NodeTouch<T, D> touch = lone_touch(contact, there.scene, there.corner, local);
         several = several || touch.obstacle == touch.several;
         if (touch.obstacle >= 0) row.value = touch.after(row.value);
       }
@@ -626,12 +603,10 @@ __global__ void __launch_bounds__(kMostSceneThreads, 1)
   __shared__ SceneState state;
   __shared__ alignas(16) char update_memory[sizeof(GridUpdateArguments<T, D>)];
   __shared__ alignas(16) char contact_memory[sizeof(ContactArguments<T, D>)];
-  __shared__ alignas(16) char pose_memory[Obstacles ? sizeof(KnownPoses<T, D>) : 16];
   const int scene = blockIdx.x;
   if (scene == a.scenes) return skip_tail(source, task, a.steps);
   auto& update = *reinterpret_cast<GridUpdateArguments<T, D>*>(update_memory);
   auto& contact = *reinterpret_cast<ContactArguments<T, D>*>(contact_memory);
-  auto& known_poses = *reinterpret_cast<KnownPoses<T, D>*>(pose_memory);
   const Topology<T, D>& t = source.topology;
   const int per_scene = t.geometry.blocks_per_scene;
   if (threadIdx.x == 0) {
@@ -669,8 +644,7 @@ __global__ void __launch_bounds__(kMostSceneThreads, 1)
                                      columns_in(rows),
                                      Blocks(rows + row_bytes, room),
                                      update,
-                                     contact,
-                                     known_poses};
+                                     contact};
     step = run_scene<Obstacles>(s, 0);
   }
   if (step == a.steps) return;
@@ -687,8 +661,7 @@ __global__ void __launch_bounds__(kMostSceneThreads, 1)
                                   columns_in(rows),
                                   Blocks(memory + table_bytes, int(left / int64_t(Blocks::bytes))),
                                   update,
-                                  contact,
-                                  known_poses};
+                                  contact};
   step = run_scene<Obstacles>(s, step);
   move_clock(a, scene, a.steps - step);
 }
@@ -700,22 +673,21 @@ void launch_block_per_scene(const Source& source, const Task& task, const BlockP
   using S = SceneShape<typename Source::Shape>;
   static_assert(S::row_bytes + sizeof(int) <= kMostSceneRow && int64_t(SceneBlocks<T, D>::bytes) <= kMostSceneBlock);
   if (source.topology.particles == 0 || a.scenes == 0) return;
-  const int fixed = (a.obstacles ? 6 : 5) * 1024;  // bytes of static shared memory, and what a thread block reserves
-  const int most = device_attribute(cudaDevAttrMaxSharedMemoryPerBlockOptin) - (fixed - 1024);
+  const int most = device_attribute(cudaDevAttrMaxSharedMemoryPerBlockOptin) - 4096;
   const int all = device_attribute(cudaDevAttrMaxSharedMemoryPerMultiprocessor);
   const int processors = device_attribute(cudaDevAttrMultiProcessorCount);
   const int64_t particles = (source.topology.particles + a.scenes - 1) / a.scenes;
   // A pool that has grown has half as many blocks more than were needed.
   const int64_t blocks = std::min<int64_t>(a.update.geometry.blocks_per_scene,
                                            3 * int64_t(source.topology.max_blocks) / (4 * a.scenes) + 2);
-  const int64_t wanted = bytes_of_table(a.update.geometry.blocks_per_scene) +
-                         bytes_of_particles<S>(particles + particles / 16) +
-                         blocks * int64_t(SceneBlocks<T, D>::bytes) + fixed;
+  const int64_t wanted =
+      bytes_of_table(a.update.geometry.blocks_per_scene) + bytes_of_particles<S>(particles + particles / 16) +
+      blocks * int64_t(SceneBlocks<T, D>::bytes) + 5 * 1024;  // and the static shared memory of the kernel
   // The order of sums depends on the number of threads, which is fixed for deterministic scenes.
   const bool in_order = a.p2g.deterministic;
   const int64_t beside = std::min<int64_t>({all / wanted, (a.scenes + processors - 1) / processors, in_order ? 1 : 4});
   const int together = int(std::max<int64_t>(beside, 1));
-  const int shared = std::min(most, all / together - fixed);
+  const int shared = std::min(most, all / together - 5 * 1024);
   // Alone on its multiprocessor, a scene of a few particles is faster with all threads, for the nodes.
   const int64_t useful = together == 1 ? kMostSceneThreads : std::max<int64_t>(128, (particles + 31) / 32 * 32);
   const int threads =

@@ -119,78 +119,11 @@ struct TileNodes {
   }
 };
 
-// Poses of the obstacles, and which of them are near each block of a tile: found once for all its nodes.
-template <class T, int D>
-struct TileObstacles {
-  ObstaclePose<T, D> pose[kMaxObstacles];
-  ContactSlot<T, D> slot[1 << D];
-  SlotBall<T, D> ball[1 << D];
-  unsigned long long near[1 << D], touching[1 << D];  // bits, as those of the slots
-
-  // By all `threads` threads; returns to all whether the result stays the same in all later substeps.
-  __device__ bool set(const ContactArguments<T, D>& a, int scene, const int (&slots)[1 << D],
-                      const SlotUpdate<T, D> (&there)[1 << D], int threads) {
-    const ObstacleRow<T, D>* const row = a.row + (a.rows == 1 ? 0 : int64_t(scene) * a.obstacles);
-    bool stays = a.step_stride == 0;
-    for (int k = threadIdx.x; k < a.obstacles; k += threads) {
-      pose[k] = obstacle_pose(a, a.kind[k], row[k], scene);
-      const bool other = a.kind[k].scene >= 0 && a.kind[k].scene != scene;
-      const bool lasts = pose[k].acts && a.kind[k].end == std::numeric_limits<double>::infinity();
-      stays = stays && (other || (lasts && rests(row[k])));
-    }
-    if (threadIdx.x < 1 << D) {
-      const int o = threadIdx.x;
-      near[o] = touching[o] = 0;
-      slot[o] = {};
-      if (slots[o] >= 0) slot[o] = slot_alone(a, scene, there[o].corner, ball[o]);
-    }
-    __syncthreads();
-    for (int i = threadIdx.x; i < a.obstacles << D; i += threads) {
-      const int o = i % (1 << D), k = i >> D;
-      if (!slot[o].active || !pose[k].acts) continue;
-      const Nearness found = nearness(a, ball[o], pose[k]);
-      if (found != Nearness::far) atomicOr(near + o, 1ull << k);
-      if (found == Nearness::touching) atomicOr(touching + o, 1ull << k);
-    }
-    return __syncthreads_and(stays);
-  }
-
-  __device__ static bool rests(const ObstacleRow<T, D>& row) {
-    bool rests = true;
-    for (const T& speed : row.velocity) rests = rests && speed == T(0);
-    for (const T& rate : row.angular_velocity) rests = rests && rate == T(0);
-    return rests;
-  }
-};
-
-// A slot with the poses of a tile, in the place of SlotPoses.
-template <class T, int D>
-struct TilePoses {
-  const ContactArguments<T, D>& a;
-  const ObstaclePose<T, D>* pose;
-  ContactSlot<T, D> s;
-
-  // Of a block of the tile, or, with a negative number, of another one.
-  __device__ TilePoses(const ContactArguments<T, D>& a, const TileObstacles<T, D>& tile, int block,
-                       const SlotUpdate<T, D>& there)
-      : a(a), pose(tile.pose) {
-    if (block >= 0) {
-      s = tile.slot[block];
-      s.touching = tile.touching[block];
-      s.near = s.touching ? tile.near[block] : 0;
-    } else {
-      s = contact_slot_of(a, there.scene, there.corner, [&](int k, const auto&) -> const auto& { return pose[k]; });
-    }
-  }
-  __device__ const ObstaclePose<T, D>& operator[](int k) const { return pose[k]; }
-};
-
 // The velocity of nodes after the grid update and contact with one surface, computed where it is read.
 template <Contacts C, class T, int D>
 struct NodeVelocities {
   const GridUpdateArguments<T, D>& update;
   const ContactArguments<T, D>& contact;
-  TileObstacles<T, D>& obstacles;  // unless C is none
   NodeRows<T, D> nodes;
 
   // Of a node that meets several surfaces, that before contact; `several` is set.
@@ -199,8 +132,7 @@ struct NodeVelocities {
     if (node.mass == T(0)) return zero_vector<T, D>();
     const Vector<T, D> v = update_node(update, there, place.local, node).value;
     if constexpr (C == Contacts::none) return v;
-    const TilePoses<T, D> poses(contact, obstacles, place.neighbour, there);
-    const NodeTouch<T, D> touch = touch_of_node(poses, node_position(contact, there.corner, place.local));
+    const NodeTouch<T, D> touch = lone_touch(contact, there.scene, there.corner, place.local);
     several = several || touch.obstacle == touch.several;
     return touch.obstacle >= 0 ? touch.after(v) : v;
   }
@@ -270,7 +202,6 @@ class ItemStep {
     empty_lists<S>(m.head);
     if (exists_) x_ = read_vector(source.position, particle_);
     __syncthreads();
-    obstacles_stay_ = false;
     active_ = 0;
 #pragma unroll
     for (int o = 0; o < 1 << D; o++) active_ |= unsigned(m.slots[o] >= 0) << o;
@@ -324,8 +255,6 @@ class ItemStep {
       if (exists_) find();
       __syncthreads();
     }
-    if (C != Contacts::none && !obstacles_stay_)
-      obstacles_stay_ = velocities.obstacles.set(velocities.contact, m.home.scene, m.slots, m.there, threads);
     const int out_of_block = m.out_of_block;
     if (C == Contacts::one_surface && out_of_block > out_of_block_at_once) return false;
     int first = 0;
@@ -410,8 +339,7 @@ class ItemStep {
   int count_ = 0;        // particles of the item
   bool exists_ = false;  // whether this thread has one
   int particle_ = 0;
-  unsigned active_ = 0;          // bits of the neighbours of the block that are
-  bool obstacles_stay_ = false;  // whether those near the tile are known for all later substeps
+  unsigned active_ = 0;  // bits of the neighbours of the block that are
   Vector<T, D> x_;
   T f_[D];
   int cell_ = 0, out_of_block_ = -1;
@@ -524,7 +452,6 @@ __global__ void __launch_bounds__(ItemStep<Source, Task>::threads, kItemsOfProce
   __shared__ int of_margin;
   __shared__ Displacement counted[2];
   __shared__ alignas(16) char contact_memory[sizeof(ContactArguments<T, D>)];
-  __shared__ alignas(16) char obstacle_memory[C == Contacts::none ? 1 : sizeof(TileObstacles<T, D>)];
   grid_dependency_sync();
   if (C == Contacts::several_surfaces && a.handover->steps == 0) return;
   const Topology<T, D>& t = source.topology;
@@ -540,7 +467,6 @@ __global__ void __launch_bounds__(ItemStep<Source, Task>::threads, kItemsOfProce
     return;
   }
   auto& contact = *reinterpret_cast<ContactArguments<T, D>*>(contact_memory);
-  auto& obstacles = *reinterpret_cast<TileObstacles<T, D>*>(obstacle_memory);
   if (C != Contacts::none && threadIdx.x == 0) contact = a.contact;
   if (threadIdx.x == 32) of_margin = used_slots(t, a.blocks, t.max_blocks);
   __syncthreads();
@@ -557,7 +483,7 @@ __global__ void __launch_bounds__(ItemStep<Source, Task>::threads, kItemsOfProce
   };
   const auto velocities = [&](int step) {
     return NodeVelocities<C, T, D>{
-        a.update, contact, obstacles, {reinterpret_cast<const NodeRow<T, D>*>(a.nodes[step % 3]), source.nodes.fixed}};
+        a.update, contact, {reinterpret_cast<const NodeRow<T, D>*>(a.nodes[step % 3]), source.nodes.fixed}};
   };
   const bool has_item = int(blockIdx.x) < items, keeps = alone && has_item;  // an item of its own
   bool more = true;
