@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..cuda_graphs.capture import is_readable
 from ..geometry.per_scene import SceneParameters, per_node
-from ..geometry.timed import REFUSALS, Path, vector_at
+from ..geometry.timed import Path, at_each, tried, vector_at
 from ..geometry.values import Value, finite, shape_of_value
 from ..geometry.vectors import norm, transform
 from .waypoints import Waypoints
@@ -155,9 +155,9 @@ class RigidMotion(SceneParameters):
         A function of time is called for all times at once if torch.vmap can map it, otherwise for one after another. It
         is called three times: for its value, its derivative and its difference.
         """
-        centre = self._checked_path(times, self._mapped(times), like)
+        centre = self._checked_path(times, at_each(self.at, times), like)
         shape = len(times), -1, like.shape[1]
-        rates = self._differenced(self._mapped, times, centre, self._rates(times, centre))
+        rates = self._differenced(lambda t: at_each(self.at, t), times, centre, self._rates(times, centre))
         return centre.to(like.dtype).reshape(shape), rates.to(like.dtype).reshape(shape)
 
     def at(self, time: Tensor) -> Tensor:
@@ -177,14 +177,6 @@ class RigidMotion(SceneParameters):
                 raise ValueError("position must return finite numbers at a time, got NaN or infinity")
         return centre
 
-    def _mapped(self, times: Tensor) -> Tensor:
-        try:
-            return torch.vmap(self.at)(times)
-        except torch.OutOfMemoryError:
-            raise
-        except REFUSALS:  # of functions that read the value of a time; a wrong function raises again below
-            return torch.stack([self.at(time) for time in times.unbind()])
-
     def _rates(self, times: Tensor, centre: Tensor) -> Tensor:
         """Derivatives of centres by their times, zero without one. In reverse mode for one centre per time, since
         forward mode imports compilers, which takes a second."""
@@ -193,11 +185,8 @@ class RigidMotion(SceneParameters):
         trained = centre.requires_grad
         with torch.inference_mode(False), torch.enable_grad():
             leaf = times.detach().clone().requires_grad_()
-            try:
-                again = self._mapped(leaf)
-            except torch.OutOfMemoryError:
-                raise
-            except REFUSALS:  # as of functions of NumPy, which have no derivative
+            again, _ = tried(lambda: at_each(self.at, leaf))
+            if again is None:  # as of functions of NumPy, which have no derivative
                 return torch.zeros_like(centre)
             rates = [torch.zeros_like(leaf) for _ in again.unbind(-1)]
             for k, part in enumerate(again.unbind(-1)):
@@ -213,14 +202,11 @@ class RigidMotion(SceneParameters):
 
     def _derivative(self, time: Tensor) -> tuple[Tensor, Tensor]:
         """Position on the path and its derivative, zero without one."""
-        try:
-            centre, rate, *_ = torch.func.jvp(self.at, (time,), (torch.ones_like(time),))
-        except torch.OutOfMemoryError:
-            raise
-        except REFUSALS:  # as of functions of NumPy. One that is wrong raises again.
-            centre = self.at(time)
-            rate = torch.zeros_like(centre)
-        return centre, rate
+        both, _ = tried(lambda: torch.func.jvp(self.at, (time,), (torch.ones_like(time),)))
+        if both is not None:
+            return both[0], both[1]
+        centre = self.at(time)  # as of functions of NumPy. One that is wrong raises again.
+        return centre, torch.zeros_like(centre)
 
     def _differenced(self, path: Callable[[Tensor], Tensor], times: Tensor, centre: Tensor, rate: Tensor) -> Tensor:
         """The derivative of a path, or its difference over a step if that is zero: a path of numbers has none.

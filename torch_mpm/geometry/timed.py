@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -16,6 +16,27 @@ Path = Callable[[Tensor], Value]
 
 REFUSALS = RuntimeError, TypeError, ValueError, IndexError
 """Errors of functions of numbers that are given a tensor of a torch transform, or several times, as the time."""
+
+T = TypeVar("T")
+
+
+def tried(call: Callable[[], T]) -> tuple[T | None, Exception | None]:
+    """Result of a call, or None and the error with which a function refuses its time. Lack of memory is no refusal."""
+    try:
+        return call(), None
+    except torch.OutOfMemoryError:
+        raise
+    except REFUSALS as error:
+        return None, error
+
+
+def at_each(function: Callable[[Tensor], Tensor], times: Tensor) -> Tensor:
+    """Results of a function of one time, stacked over times: by vmap, or one by one where it reads the value of a time.
+
+    A wrong function raises its error in the second form.
+    """
+    rows, _ = tried(lambda: torch.vmap(function)(times))
+    return torch.stack([function(time) for time in times.unbind()]) if rows is None else rows
 
 
 def vector_at(name: str, function: Path, time: Tensor) -> Tensor:
@@ -30,37 +51,22 @@ def vector_at(name: str, function: Path, time: Tensor) -> Tensor:
     """
     if time.dim() == 0:
         return _as_vector(name, function(time), time)
-    try:
-        vector, problem = _as_vector(name, function(time), time), None
-    except torch.OutOfMemoryError:
-        raise
-    except REFUSALS as error:
-        vector, problem = None, error
+    vector, problem = tried(lambda: _as_vector(name, function(time), time))
     per_scene = vector is not None and vector.dim() == 2 and len(vector) == len(time)
     if vector is not None and per_scene and vector.shape[1] != len(time):
         return vector
-    try:
-        return _of_scenes(name, function, time)
-    except torch.OutOfMemoryError:
-        raise
-    except REFUSALS as error:
-        if vector is not None and per_scene:  # of a function of times [B] alone
-            return vector
-        raise error from problem
+    rows, refusal = tried(lambda: _of_scenes(name, function, time))
+    if rows is not None:
+        return rows
+    if vector is not None and per_scene:  # of a function of times [B] alone
+        return vector
+    assert refusal is not None
+    raise refusal from problem
 
 
 def _of_scenes(name: str, function: Path, time: Tensor) -> Tensor:
     """Vectors [B, D] of a function that is called with the time of each scene, and may return those of all scenes."""
-
-    def at(time: Tensor) -> Tensor:
-        return _as_vector(name, function(time), time)
-
-    try:
-        rows = torch.vmap(at)(time)
-    except torch.OutOfMemoryError:
-        raise
-    except REFUSALS:  # of functions that read the value of a time
-        rows = torch.stack([at(one) for one in time.unbind()])
+    rows = at_each(lambda one: _as_vector(name, function(one), one), time)
     if rows.dim() == 3 and rows.shape[1] in (1, len(time)):
         return rows[:, 0] if rows.shape[1] == 1 else rows.diagonal(dim1=0, dim2=1).mT
     if rows.dim() != 2:

@@ -21,7 +21,7 @@ from ..boundaries import Obstacle
 from ..errors import NUMBER_OR_TENSOR, check_number, check_real, shape_of
 from ..geometry.per_scene import per_node
 from ..geometry.shapes import with_gradient
-from ..geometry.timed import REFUSALS
+from ..geometry.timed import tried
 from ..geometry.vectors import unit
 from ..grid.bspline import base_node, bspline
 from ..grid.grid import Blocks
@@ -493,15 +493,17 @@ def _at(value: Timed, time: float | Tensor) -> Number:
         return value
     if not callable(value):
         return _returned(value)
-    try:
+    if not isinstance(time, Tensor) or time.dim() == 0:
         return _returned(value(time))
-    except REFUSALS as error:  # as of functions of numbers, where scenes have times of their own
-        if not isinstance(time, Tensor) or time.dim() == 0:
-            raise
-        try:
-            return torch.stack([torch.as_tensor(_returned(value(one))).to(time).reshape(()) for one in time.unbind()])
-        except REFUSALS:
-            raise error from None
+    number, problem = tried(lambda: _returned(value(time)))
+    if problem is None and number is not None:
+        return number
+    # A function of numbers, where scenes have times of their own.
+    rows, _ = tried(lambda: [torch.as_tensor(_returned(value(one))).to(time).reshape(()) for one in time.unbind()])
+    if rows is None:
+        assert problem is not None
+        raise problem from None
+    return torch.stack(rows)
 
 
 def _returned(value: Any) -> Number:

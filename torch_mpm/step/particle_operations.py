@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from ..cuda_graphs.capture import DeviceConstantCache
 from ..errors import check_number, check_vector, shape_of
-from ..geometry.timed import REFUSALS
+from ..geometry.timed import tried
 from ..laws.parameters import TensorModule
 from ..ops.arguments import per_particle
 from ..state.state import State
@@ -231,20 +231,13 @@ class _Numbers:
         each scene. So is one for as many scenes as dimensions, where a product with the times has this shape too.
         """
         whole = getattr(state, "particles", len(state)), state.x.shape[1]
-        value, problem = None, None
-        try:
-            value = function(time)
-        except torch.OutOfMemoryError:
-            raise
-        except REFUSALS as error:
-            problem = error
+        value, problem = tried(lambda: function(time))
         if isinstance(value, Tensor) and tuple(value.shape) == whole and len(time) != whole[1]:
             return self._given(name, value, state)
-        try:
-            rows = [self._given(name, function(one), state) for one in time.unbind()]
-        except REFUSALS as error:
-            if problem is not None:
-                raise error from problem
+        rows, refusal = tried(lambda: [self._given(name, function(one), state) for one in time.unbind()])
+        if rows is None:
+            if refusal is not None and problem is not None:
+                raise refusal from problem
             return self._given(name, value, state)  # of a function of times [B] alone
         if all(row.dim() == 1 for row in rows):
             return per_particle(torch.stack(rows), state.scene, len(state))
