@@ -6,6 +6,7 @@
 #include "rollout/laws_p2g.h"
 #include "rollout/next_grid.h"
 #include "rollout/schedules/block_per_scene.h"
+#include "rollout/segment_clock.h"
 #include "rollout/survey.h"
 
 #define MPM_ROLLOUT_KERNELS(PLAIN, ORDERED, SIZE)   \
@@ -31,6 +32,7 @@ namespace mpm::cuda {
 // times[k + 1] = times[k] + dt, on the device.
 void add_up_times(double* times, double first, double dt, int64_t count, Stream stream);
 void block_per_scene_status(const BlockPerSceneStatusArguments& a, Stream stream);
+void segment_clock(const SegmentClockArguments& a, Stream stream);
 // The bits of the largest absolute value of `count` numbers; zero where there is none.
 void find_largest(const Field<const float>& numbers, int64_t count, int* bits, Stream stream);
 template <class T, int D>

@@ -1,5 +1,5 @@
 #include "cuda/launch.cuh"
-#include "rollout/segment_clock.h"
+#include "rollout/kernels.h"
 
 namespace mpm::cuda {
 namespace {

@@ -1,13 +1,7 @@
-#include "rollout/segment_clock.h"
-#include "common/backend.h"
+#include "rollout/kernels.h"
 
 // dt of the next substeps of each scene and its time after them.
 namespace mpm {
-#if MPM_BACKEND == MPM_BACKEND_IS_cuda
-namespace cuda {
-void segment_clock(const SegmentClockArguments& a, Stream stream);
-}
-#endif
 namespace {
 
 Tensor segment_clock(const Tensor& clock, const OptionalTensor& rate, double cfl, double longest, int64_t most,
