@@ -460,8 +460,8 @@ def heat_solve(result: dict[str, Any]) -> str:
     rows = [[f"{r:g}", f"{contrast:g}", *(cells.get((r, contrast, k)) for k in kinds)] for r, contrast in places]
     intro = (
         "Number of iterations, and relative RMS error against a direct solve (benchmarks/stability/heat.py), for "
-        "64 × 64 cells, half of which conduct worse by the factor `contrast`; solved to 1e-10 (float32: 1e-6) of the "
-        "first residual.\nSmaller r and Chebyshev iteration: benchmarks/results/heat_stability.md."
+        "64 × 64 cells.\nHalf of the cells conduct worse by the factor `contrast`.\nThe solve ends at 1e-10 (float32: "
+        "1e-6) of the first residual.\nSmaller r and Chebyshev iteration: benchmarks/results/heat_stability.md."
     )
     return "\n\n".join([intro, common.table(("r", "contrast", *kinds), rows)])
 

@@ -44,7 +44,7 @@ def test_random_clocks(device, substeps, choose, longest):
 
 
 def test_substeps_of_a_scene(device):
-    """A span of 1 s at a limit of 0.3 s: four substeps of 0.25 s, of which a segment of three leaves one."""
+    """A span of 1 s at a limit of 0.3 s takes four substeps of 0.25 s. A segment of three leaves one."""
     rows = table(device, now=[2.0], end=[3.0])
     rate = torch.full((1,), 1 / 0.6, dtype=F64, device=device)
     rows = segment_clock(rows, rate, 0.5, math.inf, 100, True, 3)

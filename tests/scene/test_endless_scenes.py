@@ -45,7 +45,7 @@ def test_the_number_of_substeps_is_reported(tmp_path, capsys):
 
 @pytest.mark.parametrize(("start", "share"), [(0.0, 1.0), (0.02, 0.5)])
 def test_the_speed_of_emitters_counts(start, share, tmp_path, capsys):
-    """Compared with the substeps that a run takes, of which there are few without the emitter."""
+    """The estimate is compared with the substeps of a run. Without the emitter there are few."""
     scene = tmp_path / "scene.toml"
     scene.write_text(FILE.format(duration=0.04))
     emitter = f"{EMITTER}velocity=[0.0, -500.0], start={start}}}]"

@@ -183,7 +183,7 @@ def _names_in(remarks: Sequence[Sequence[str]], count: int) -> list[str]:
 
 
 def _check_first(names: Sequence[str], cells: Sequence[str]) -> None:
-    """Check the first row of numbers against the names of the columns, of which others may be texts."""
+    """Check the first row of numbers against the names of the columns. Columns that are not read may be texts."""
     if names and len(names) != len(cells):
         raise ValueError(f"it names {len(names)} columns {list(names)}, and has {len(cells)} numbers in a row")
     used = [cells[k] for columns in _named(names) for k in columns] if names else cells

@@ -151,7 +151,7 @@ class CudaCall {
     return false;
   }
 
-  // The substeps from `step_` on, of which a CUDA graph repeats pairs.
+  // Computes the substeps from `step_` on. A CUDA graph repeats pairs of them.
   void run_per_step() {
     while (step_ < in_.n) {
       last_ = int(step_ % 2);
