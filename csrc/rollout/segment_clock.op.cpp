@@ -6,10 +6,11 @@ namespace {
 
 Tensor segment_clock(const Tensor& clock, const OptionalTensor& rate, double cfl, double longest, int64_t most,
                      bool choose, int64_t substeps) {
-  const int64_t scenes = clock.dim() == 2 ? clock.size(0) : -1;
-  STD_TORCH_CHECK(clock.scalar_type() == ScalarType::Double && scenes >= 0 && clock.size(1) == kSegmentClockSize &&
-                      clock.is_contiguous(),
-                  "clock must be contiguous float64 [B, ", int(kSegmentClockSize), "]");
+  STD_TORCH_CHECK(clock.dim() == 2 && clock.size(1) == kSegmentClockSize, "clock must have shape [B, ",
+                  int(kSegmentClockSize), "], got ", shape_of(clock));
+  check_type(clock, "clock", ScalarType::Double, clock);
+  STD_TORCH_CHECK(clock.is_contiguous(), "clock must be contiguous");
+  const int64_t scenes = clock.size(0);
   STD_TORCH_CHECK(substeps >= kAllLeft, "substeps must be -1 or not negative, got ", substeps);
   Tensor next = empty(clock, {scenes, kSegmentClockSize}, ScalarType::Double);
   SegmentClockArguments a;
@@ -17,9 +18,8 @@ Tensor segment_clock(const Tensor& clock, const OptionalTensor& rate, double cfl
   a.clock = static_cast<const double*>(clock.const_data_ptr());
   if (has(rate)) {
     const Tensor& r = rate.value();
-    STD_TORCH_CHECK(r.scalar_type() == ScalarType::Double && r.dim() == 1 && r.size(0) == scenes,
-                    "rate must be float64 [B] = [", scenes, "]");
-    STD_TORCH_CHECK(r.is_cuda() == clock.is_cuda(), "rate must be on the device of clock");
+    check_shape(r, "rate", {scenes});
+    check_type(r, "rate", ScalarType::Double, clock);
     a.rate = static_cast<const double*>(r.const_data_ptr());
     a.rate_stride = r.stride(0);
   }

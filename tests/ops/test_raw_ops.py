@@ -22,7 +22,7 @@ PLANS = ("plan_substeps", "latest_schedule")
 """Ops without tensors whose sizes count, tested in tests/rollouts/test_plan.py."""
 OPS = [name for name in operators.operators() if name not in PLANS]
 CALLS = [(dim, *call) for dim in (2, 3) for call in operators.calls(dim) if call[0] not in PLANS]
-COMPARED = ("x", "F", "state", "velocity", "nodes", "r", "gravity", "previous_status")
+COMPARED = ("x", "F", "state", "velocity", "nodes", "r", "gravity", "previous_status", "clock")
 """Arguments that define the shapes of the others."""
 ANY_NUMBER = ("mu", "lam", "alpha", "cohesion", "scene_dt", "scene_time", "obstacles")
 """Tensors that are given once, per scene or per particle."""
