@@ -1,7 +1,10 @@
+#include "common/team.h"
 #include "grid/topology.op.h"
 #include "implicit/kernels.h"
-#include "rollout/replay.h"
 #include "transfer/kernels.h"
+#if MPM_BACKEND == MPM_BACKEND_IS_cuda
+#include "cuda/graph.h"
+#endif
 
 // Hessian of an implicit step: its product with node vectors, its diagonal blocks, and the solve.
 namespace mpm {

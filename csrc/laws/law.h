@@ -18,8 +18,8 @@
 // (laws/principal_law.h). Their derivatives come from dual numbers. A law may define its own kernel bodies
 // (laws/sand.h) where its adjoint needs more.
 //
-// No other file has to name the law: setup.py compiles laws/law.cpu.cpp and laws/law.cu once for each such header,
-// which register its kernels (laws/registry.h) for the ops and Python.
+// No other file has to name the law: setup.py compiles laws/law.cpu.cpp, laws/law.cu and rollout/fused_law.cu once for
+// each such header, which register its kernels (laws/registry.h, rollout/fused_law.h) for the ops and Python.
 #ifndef MPM_REGISTER_LAW
 #define MPM_REGISTER_LAW(Law)
 #endif

@@ -4,9 +4,6 @@
 #include <vector>
 
 #include "laws/law.h"
-#include "rollout/schedules/block_per_scene.h"
-#include "rollout/schedules/fused_g2p2g.h"
-#include "rollout/schedules/persistent.h"
 
 // Registry of the compiled laws with their kernels. Each object file of laws/law.cpu.cpp and laws/law.cu registers its
 // laws when the library is loaded; ops find them by name, and Python reads the whole list.
@@ -32,15 +29,6 @@ struct LawKernels {
   void (*scalar)(const LawScalarArguments<T, D>&, void* stream) = nullptr;
   void (*energy_backward)(const LawEnergyBackwardArguments<T, D>&, void* stream) = nullptr;
   void (*energy_double_backward)(const LawEnergyDoubleBackwardArguments<T, D>&, void* stream) = nullptr;
-  // Update of F or J, law and P2G in one, the stress in registers: for quadratic weights and the MLS form, on CUDA.
-  void (*p2g)(const LawUpdateArguments<T, D>&, const LateDeformation<T, D>&, const P2GArguments<T, D>&,
-              const ReorderOnScatter<T, D>&, void* stream) = nullptr;
-  // G2P and the next P2G in one.
-  void (*g2p2g)(const LawUpdateArguments<T, D>&, const G2P2GArguments<T, D>&, void* stream) = nullptr;
-  // Substeps of few particles, for quadratic weights and the MLS form, on CUDA 13.
-  void (*persistent)(const LawUpdateArguments<T, D>&, const PersistentArguments<T, D>&, void* stream) = nullptr;
-  // All substeps of small scenes, for quadratic weights and the MLS form, on CUDA.
-  void (*block_per_scene)(const LawUpdateArguments<T, D>&, const BlockPerSceneArguments<T, D>&, void* stream) = nullptr;
   void (*tangent)(const LawTangentArguments<T, D>&, void* stream) = nullptr;
 };
 
@@ -112,10 +100,6 @@ void fill_kernels(LawEntry& entry) {
     kernels.scalar = K::scalar;
     kernels.energy_backward = K::energy_backward;
     if constexpr (Law::has_tangent) kernels.tangent = K::tangent;
-    if constexpr (requires { &K::p2g; }) kernels.p2g = &K::p2g;
-    if constexpr (requires { &K::g2p2g; }) kernels.g2p2g = &K::g2p2g;
-    if constexpr (requires { &K::persistent; }) kernels.persistent = &K::persistent;
-    if constexpr (requires { &K::block_per_scene; }) kernels.block_per_scene = &K::block_per_scene;
     if constexpr (Law::twice_differentiable) kernels.double_backward = K::double_backward;
     if constexpr (Law::twice_differentiable_energy) kernels.energy_double_backward = K::energy_double_backward;
   }

@@ -4,72 +4,29 @@
 #include <string>
 #include <type_traits>
 
-#include "grid/activate.op.h"
 #include "grid/impulse.op.h"
 #include "grid/obstacle.op.h"
 #include "grid/walls.op.h"
 #include "laws/law.op.h"
+#include "rollout/fused_law.h"
 #include "rollout/inputs.h"
 #include "rollout/kernels.h"
 #include "rollout/plan.op.h"
+#include "rollout/pool.h"
 #include "transfer/kernels.h"
 
 // Many steps in one call: activation, laws, P2G, grid update, obstacles and G2P in the order of the ops of one step, in
 // buffers that belong to the call. Shared by the ops of rollouts.
 namespace mpm {
 
-// Size of a pool with headroom, as for a growing grid in torch_mpm/grid/grid.py.
-inline int64_t with_headroom(int64_t blocks) { return blocks + blocks / 2 + 16; }
-
-// The activation and the nodes, for one size of the pool of blocks.
-template <class T, int D>
-struct Pool {
-  ActivationTensors active;
-  Tensor nodes, updated, velocity;
-
-  void make(const Tensor& x, ActivateArguments<T, D>& a, bool obstacles, backend::Stream stream) {
-    active.make(x, a, stream);
-    nodes = empty(x, nodes_shape(a));
-    updated = empty(x, nodes_shape(a));
-    if (obstacles) velocity = empty(x, nodes_shape(a));
-  }
-
-  // Tensors are made by ints(shape) and numbers(shape); the nodes and the workspace are given.
-  template <class Ints, class Numbers>
-  void lay_out(const Tensor& given, ActivateArguments<T, D>& a, bool obstacles, const Ints& ints,
-               const Numbers& numbers) {
-    active.lay_out(a, ints({ActivationTensors::table_size(a)}), ints);
-    nodes = given;
-    updated = numbers(nodes_shape(a));
-    if (obstacles) velocity = numbers(nodes_shape(a));
-  }
-
-  static Shape nodes_shape(const ActivateArguments<T, D>& a) { return {int64_t(a.slots()) * kBlockNodes<D>, 1 + D}; }
-};
-
-template <class T, int D>
-Topology<T, D> topology_of(const ActivateArguments<T, D>& a) {
-  Topology<T, D> t;
-  t.geometry = a.geometry;
-  t.scenes = a.scenes;
-  t.max_blocks = a.slots();
-  t.particles = a.particles;
-  t.table = a.table;
-  t.block = a.block;
-  t.offsets = a.offsets;
-  t.index = a.index;
-  t.schedule = a.schedule;
-  t.schedule_size = a.schedule_size;
-  return t;
-}
-
 // The kernels of a step with their arguments; a call makes most of these once.
 template <class T, int D>
 struct Substeps {
   const SubstepsInputs& in;
   std::vector<LawCall> calls;
-  bool plastic = false;  // some law changes F
-  int64_t columns = 0;   // of the history of all laws
+  FusedLawKernels<T, D> fused_kernels;  // of the first law
+  bool plastic = false;                 // some law changes F
+  int64_t columns = 0;                  // of the history of all laws
   ActivateArguments<T, D> activation;
   std::vector<LawUpdateArguments<T, D>> laws;
   P2GArguments<T, D> p2g;
@@ -240,7 +197,7 @@ struct Substeps {
 
   // Lets P2G compute the stress, if there is a kernel for it.
   void fuse(bool keeps_stress) {
-    fused = why_not_fused_law(facts).empty() && !p2g.deterministic && calls[0].law->kernels<T, D>().p2g;
+    fused = why_not_fused_law(facts).empty() && !p2g.deterministic && fused_kernels.p2g;
     if (fused && !keeps_stress) forget_stress();
   }
 
@@ -307,7 +264,7 @@ struct Substeps {
   void move_grid(backend::Stream stream) {
     clear_nodes(stream);
     if (fused)
-      calls[0].law->kernels<T, D>().p2g(laws[0], late, p2g, reorder, stream);
+      fused_kernels.p2g(laws[0], late, p2g, reorder, stream);
     else
       backend::p2g(in.lattice.order(), p2g, stream);
     move_nodes(stream);
@@ -369,80 +326,109 @@ struct Substeps {
   void use_pool();
 
  private:
+  void set_laws();
+  void set_transfers();
+  void set_grid_update();
+  void set_obstacles();
+  void set_clocks();
   PlanFacts facts_of_call() const;
 };
 
 template <class T, int D>
 Substeps<T, D>::Substeps(const SubstepsInputs& inputs) : in(inputs) {
-  const Tensor& x = in.x;
-  const int64_t P = x.size(0);
   STD_TORCH_CHECK(in.n > 0 && in.n <= kMostSteps, "n must be 1 to ", kMostSteps, ", got ", in.n);
   STD_TORCH_CHECK(in.dt > 0 && std::isfinite(in.dt), "dt must be positive and finite, got ", in.dt);
   STD_TORCH_CHECK(in.flip >= 0 && in.flip <= 1, "flip must be between 0 and 1, got ", in.flip);
   STD_TORCH_CHECK(in.wants_C || !in.apic, "apic needs wants_C");
-  calls = law_calls(in.laws, in.options, in.parameters, in.history, in.variables, D);
-  check_material(in.material, calls, x);
-  activation = activate_arguments<T, D>(in.lattice, x, in.scene, in.ids, in.scenes, in.max_blocks);
+  activation = activate_arguments<T, D>(in.lattice, in.x, in.scene, in.ids, in.scenes, in.max_blocks);
   if (has(in.previous_status))
-    previous_status = int_pointer(*in.previous_status, "previous_status", x, {1 + in.scenes, kStatusSize});
-  stress = empty_particles(x, {P, D, D});
-  kept = result(x, flips(), {P, D});
+    previous_status = int_pointer(*in.previous_status, "previous_status", in.x, {1 + in.scenes, kStatusSize});
+  set_laws();
+  set_transfers();
+  set_grid_update();
+  set_obstacles();
+  set_clocks();
+  if (has(in.impulse)) {
+    check_shape(*in.impulse, "impulse", impulse_shape());
+    check_type(*in.impulse, "impulse", ScalarType::Double, in.x);
+    STD_TORCH_CHECK(!flips() || !update.walls.mirrored, "impulses on mirrors are not counted with flip, got ", in.flip);
+  }
+  facts = facts_of_call();
+}
+
+template <class T, int D>
+void Substeps<T, D>::set_laws() {
+  const Tensor& x = in.x;
+  calls = law_calls(in.laws, in.options, in.parameters, in.history, in.variables, D);
+  fused_kernels = fused_kernels_of<T, D>(calls[0].law->info.name);
+  check_material(in.material, calls, x);
+  stress = empty_particles(x, {x.size(0), D, D});
   if (has(in.material)) torch::stable::zero_(stress);  // of particles without a law
-  for (size_t k = 0; k < calls.size(); k++) {
-    const LawInfo& info = calls[k].law->info;
+  for (const LawCall& call : calls) {
+    const LawInfo& info = call.law->info;
     STD_TORCH_CHECK(in.wants_C || !info.viscous, "the viscous law ", info.name, " needs wants_C");
-    kernels_of<T, D>(*calls[k].law);
+    kernels_of<T, D>(*call.law);
     LawUpdateArguments<T, D> a;
-    a.law = law_arguments<T, D>(calls[k], x, in.F, in.J, {}, in.scene, in.material, in.scenes);
-    a.adds = calls[k].adds;
+    a.law = law_arguments<T, D>(call, x, in.F, in.J, {}, in.scene, in.material, in.scenes);
+    a.adds = call.adds;
     a.stress = field<T>(stress);
     laws.push_back(a);
     plastic |= info.plastic;
-    columns = calls[k].first_column + history_size(info, calls[k].history, D);
+    columns = call.first_column + history_size(info, call.history, D);
   }
-  p2g.mass = input<T>(in.mass, "mass", x, {P});
-  p2g.volume = input<T>(in.volume, "volume", x, {P});
+}
+
+template <class T, int D>
+void Substeps<T, D>::set_transfers() {
+  const int64_t P = in.x.size(0);
+  kept = result(in.x, flips(), {P, D});
+  p2g.mass = input<T>(in.mass, "mass", in.x, {P});
+  p2g.volume = input<T>(in.volume, "volume", in.x, {P});
   p2g.stress = field<const T>(stress);
   p2g.dt = update.dt = advance.dt = in.dt;
   p2g.form = advance.form = stress_form_of(in.stress_form);
   p2g.deterministic = in.lattice.deterministic();
+  advance.gather.moment_scale = in.lattice.inverse_inertia();
+  advance.gather.lost = NAN;
+}
+
+template <class T, int D>
+void Substeps<T, D>::set_grid_update() {
   update.geometry = activation.geometry;
   update.block_count = activation.scenes * activation.geometry.blocks_per_scene;
   update.walls = walls<T, D>(in.wall_kind, in.wall_plane, in.wall_friction, in.lattice);
-  if (has(in.gravity)) {
-    check_shape(*in.gravity, "gravity", {in.scenes, D});
-    check_like(*in.gravity, "gravity", x);
-    STD_TORCH_CHECK(in.gravity->is_contiguous(), "gravity must be contiguous");
-    update.gravity = static_cast<const T*>(in.gravity->data_ptr());
-  }
+  if (!has(in.gravity)) return;
+  check_shape(*in.gravity, "gravity", {in.scenes, D});
+  check_like(*in.gravity, "gravity", in.x);
+  STD_TORCH_CHECK(in.gravity->is_contiguous(), "gravity must be contiguous");
+  update.gravity = static_cast<const T*>(in.gravity->data_ptr());
+}
+
+template <class T, int D>
+void Substeps<T, D>::set_obstacles() {
   obstacles = has(in.obstacle_table);
   STD_TORCH_CHECK(!obstacles || has(in.obstacle_data), "obstacles need data");
-  if (obstacles) {
-    contact = obstacle_arguments<T, D>(x, in.lattice, *in.obstacle_table, in.obstacle_data.value(), in.shape, in.sizes,
-                                       in.contact_kind, in.obstacle_scene, in.start, in.end, {}, in.time, in.n);
-    set_walls(contact, in.wall_kind, in.wall_plane);
-    check_scenes(contact, in.scenes);
-  }
+  if (!obstacles) return;
+  contact = obstacle_arguments<T, D>(in.x, in.lattice, *in.obstacle_table, in.obstacle_data.value(), in.shape, in.sizes,
+                                     in.contact_kind, in.obstacle_scene, in.start, in.end, {}, in.time, in.n);
+  set_walls(contact, in.wall_kind, in.wall_plane);
+  check_scenes(contact, in.scenes);
+}
+
+// Time steps and times of scenes with clocks of their own.
+template <class T, int D>
+void Substeps<T, D>::set_clocks() {
   STD_TORCH_CHECK(has(in.scene_dt) == has(in.scene_time), "scene_dt must be given with scene_time");
-  if (has(in.scene_dt)) {
-    const auto type = x.scalar_type();
-    for (const auto& [tensor, name, expected] :
-         {std::tuple(*in.scene_dt, "scene_dt", type), std::tuple(*in.scene_time, "scene_time", ScalarType::Double)}) {
-      check_shape(tensor, name, {in.scenes});
-      check_type(tensor, name, expected, x);
-      STD_TORCH_CHECK(tensor.is_contiguous(), name, " must be contiguous");
-    }
-    p2g.scene_dt = advance.scene_dt = field<const T>(*in.scene_dt);
-    update.scene_dt = p2g.scene_dt.pointer;
+  if (!has(in.scene_dt)) return;
+  const auto type = in.x.scalar_type();
+  for (const auto& [tensor, name, expected] :
+       {std::tuple(*in.scene_dt, "scene_dt", type), std::tuple(*in.scene_time, "scene_time", ScalarType::Double)}) {
+    check_shape(tensor, name, {in.scenes});
+    check_type(tensor, name, expected, in.x);
+    STD_TORCH_CHECK(tensor.is_contiguous(), name, " must be contiguous");
   }
-  if (has(in.impulse)) {
-    check_shape(*in.impulse, "impulse", impulse_shape());
-    check_type(*in.impulse, "impulse", ScalarType::Double, x);
-    STD_TORCH_CHECK(!flips() || !update.walls.mirrored, "impulses on mirrors are not counted with flip, got ", in.flip);
-  }
-  advance.gather.moment_scale = in.lattice.inverse_inertia();
-  advance.gather.lost = NAN;
-  facts = facts_of_call();
+  p2g.scene_dt = advance.scene_dt = field<const T>(*in.scene_dt);
+  update.scene_dt = p2g.scene_dt.pointer;
 }
 
 // The facts of a call, except those of the stream and the device.

@@ -1,6 +1,6 @@
 #include "common/signals.h"
+#include "common/team.h"
 #include "rollout/recorded.h"
-#include "rollout/replay.h"
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
 #include "rollout/schedules/sorted_cpu.op.h"
 #else

@@ -1,5 +1,5 @@
+#include "common/team.h"
 #include "rollout/recorded.h"
-#include "rollout/replay.h"
 
 // The adjoint of n steps in one call. The steps are recomputed with a record of the inputs of each, unless the forward
 // pass has made the record; then the adjoint kernels process them from the last to the first. On deterministic CUDA

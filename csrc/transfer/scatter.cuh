@@ -341,22 +341,22 @@ template <class S, class Source, int Most, class T, int D>
 __device__ void load_particles(const Source& source, const Topology<T, D>& t, int block, BaseBlock<T, D>& base_block,
                                const SharedParticles<S>& shared, OutOfBlockList<Most>& out_of_block, int begin, int n,
                                bool in_order) {
-  constexpr bool may_settle = requires { source.settles(); };
-  __shared__ CellOrder<std::conditional_t<may_settle, S, NoCells>> order;
-  bool settles = false;
-  if constexpr (may_settle) settles = source.settles();
-  int following = int(threadIdx.x) < n && !settles ? t.index[begin + threadIdx.x] : 0;
+  constexpr bool may_reorder = requires { source.reorders(); };
+  __shared__ CellOrder<std::conditional_t<may_reorder, S, NoCells>> order;
+  bool reorders = false;
+  if constexpr (may_reorder) reorders = source.reorders();
+  int following = int(threadIdx.x) < n && !reorders ? t.index[begin + threadIdx.x] : 0;
   if (threadIdx.x == 32) base_block.template set<S::Order>(t, block);
   if (threadIdx.x == 0) out_of_block.count = 0;
   empty_lists<S>(shared.head);
   __syncthreads();
-  if constexpr (may_settle)
-    if (settles) order_by_cell<S>(source, t, base_block, shared, order, begin, n, in_order);
+  if constexpr (may_reorder)
+    if (reorders) order_by_cell<S>(source, t, base_block, shared, order, begin, n, in_order);
 #pragma unroll 1
   for (int k = threadIdx.x; k < n; k += S::threads) {
     const int row = SharedParticles<S>::row(k);
     int p = following;
-    if (settles)
+    if (reorders)
       p = *reinterpret_cast<const int*>(shared.pairs + row);
     else if (k + S::threads < n)
       following = t.index[begin + k + S::threads];
@@ -366,8 +366,8 @@ __device__ void load_particles(const Source& source, const Topology<T, D>& t, in
     const Vector<T, D> x = read_vector(source.position, p);
     const bool in_block = base_block.template locate<S::Order>(t.geometry, x, cell, f);
     const auto loaded = [&] {
-      if constexpr (may_settle)
-        return source.load(p, base_block.scene, begin + (settles ? order.start[cell] + shared.next[row] : k));
+      if constexpr (may_reorder)
+        return source.load(p, base_block.scene, begin + (reorders ? order.start[cell] + shared.next[row] : k));
       else
         return source.load(p, base_block.scene);
     }();

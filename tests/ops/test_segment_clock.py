@@ -67,11 +67,22 @@ def test_scenes_that_wait_or_may_not_move(device):
 def test_wrong_tensors(device):
     rows, rate = table(device, end=[1.0, 1.0]), torch.ones(2, dtype=F64, device=device)
     rest = 0.5, math.inf, 10, True, 4
-    for wrong in (rows.float(), rows[:, :7], rows[0], rows.T.contiguous().T):
-        with pytest.raises(RuntimeError, match="clock must be contiguous float64"):
+    clocks = {
+        "be float64, got float32": rows.float(),
+        "have shape .B, 8., got .2, 7.": rows[:, :7],
+        "have shape .B, 8., got .8.": rows[0],
+        "be contiguous": rows.T.contiguous().T,
+    }
+    for message, wrong in clocks.items():
+        with pytest.raises(RuntimeError, match=f"clock must {message}"):
             segment_clock(wrong, rate, *rest)
-    for wrong in (rate.float(), rate[:1], rows):
-        with pytest.raises(RuntimeError, match="rate must be float64"):
+    rates = {
+        "be float64, got float32": rate.float(),
+        "have shape .2., got .1.": rate[:1],
+        "have shape .2., got .2, 8.": rows,
+    }
+    for message, wrong in rates.items():
+        with pytest.raises(RuntimeError, match=f"rate must {message}"):
             segment_clock(rows, wrong, *rest)
     with pytest.raises(RuntimeError, match="substeps must be"):
         segment_clock(rows, rate, *rest[:-1], -2)

@@ -28,7 +28,7 @@ void run_scenes(Substeps<T, D>& s, int64_t n, int64_t after, double time, const 
   a.spare_blocks = int(spare);
   a.blocks_taken = first;
   a.errors = reinterpret_cast<SceneErrors*>(first + 1);
-  s.calls[0].law->template kernels<T, D>().block_per_scene(s.laws[0], a, stream);
+  s.fused_kernels.block_per_scene(s.laws[0], a, stream);
   backend::block_per_scene_status({int(in.scenes), s.activation.max_blocks, n, a.errors, activated, status,
                                    s.activation.id, s.activation.id_stride},
                                   stream);

@@ -1,7 +1,7 @@
 #pragma once
 
 #include "common/signals.h"
-#include "rollout/replay.h"
+#include "cuda/graph.h"
 #include "rollout/schedules/block_per_scene.op.h"
 #include "rollout/schedules/fused_g2p2g.op.h"
 #include "rollout/schedules/persistent.op.h"

@@ -1,7 +1,7 @@
 #pragma once
 
 #include "common/signals.h"
-#include "rollout/replay.h"
+#include "cuda/graph.h"
 #include "rollout/step_kernels.h"
 
 // A call of many substeps on CUDA that owns its particles: G2P and the next P2G are one kernel while an activation
@@ -35,7 +35,6 @@ class FusedG2P2G {
     return static_cast<Displacement*>(s_.displacements.data_ptr()) + step % 2;
   }
   Displacement* nowhere() { return static_cast<Displacement*>(nowhere_.data_ptr()); }
-  auto& kernels() { return s_.calls[0].law->template kernels<T, D>(); }
 
   void begin(const Particles<const T>& given, const int* before);
   void use_own();
@@ -105,7 +104,7 @@ void FusedG2P2G<T, D>::begin(const Particles<const T>& given, const int* before)
   s_.activation.displacement = nullptr;
   s_.activation.next_displacement = displacement(0);
   s_.activate(before, status(0), stream_);
-  kernels().p2g(s_.laws[0], s_.late, s_.p2g, reorder, stream_);
+  s_.fused_kernels.p2g(s_.laws[0], s_.late, s_.p2g, reorder, stream_);
   update_grid(0, stream_);
 }
 
@@ -142,11 +141,11 @@ void FusedG2P2G<T, D>::run_substep(int64_t step, bool ends, backend::Stream stre
   s_.advance.displacement = nowhere();
   backend::g2p_advance(s_.in.lattice.order(), s_.advance, stream);
   s_.activate(status(step - 1), status(step), stream);
-  kernels().p2g(s_.laws[0], s_.late, s_.p2g, s_.reorder, stream);
+  s_.fused_kernels.p2g(s_.laws[0], s_.late, s_.p2g, s_.reorder, stream);
   if (!ends) {
     G2P2GArguments<T, D> a{s_.p2g, s_.late, s_.advance, s_.reorder, s_.reorder.copy, s_.next.items_taken};
     a.advance.displacement = displacement(step);
-    kernels().g2p2g(s_.laws[0], a, stream);
+    s_.fused_kernels.g2p2g(s_.laws[0], a, stream);
   }
   update_grid(step, stream);
 }

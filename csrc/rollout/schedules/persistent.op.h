@@ -2,7 +2,7 @@
 
 #include <atomic>
 
-#include "rollout/replay.h"
+#include "cuda/graph.h"
 #include "rollout/step_kernels.h"
 
 // The schedule of few particles with thread blocks that all run at once, on CUDA.
@@ -49,7 +49,7 @@ bool run_persistent(Substeps<T, D>& s, int* activated, int* status, backend::Str
     a.loop = condition;
     s.find_blocks(on);
     backend::clear(arrived, on);
-    s.calls[0].law->template kernels<T, D>().persistent(s.laws[0], a, on);
+    s.fused_kernels.persistent(s.laws[0], a, on);
   };
   try {
     if (works_on == device) launch(stream, 0);  // so that the device works while the host makes the graph

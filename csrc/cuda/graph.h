@@ -9,30 +9,9 @@
 
 #include "common/backend.h"
 
-#if MPM_BACKEND == MPM_BACKEND_IS_cpu
-#include "cpu/parallel.h"
-#endif
-
-// Overheads that a call of many substeps avoids: starts of threads for each loop, and launches of kernels by the host.
+// Kernels that are launched many times in the same order, as CUDA graphs: the host launches one graph in place of many
+// kernels, and a graph with a loop needs no host between its turns.
 namespace mpm {
-
-#if MPM_BACKEND == MPM_BACKEND_IS_cpu
-
-// Runs `work()`, which has many parallel loops over `particles`, with one team of threads, or without one.
-template <class Work>
-void with_team(int64_t particles, const Work& work) {
-  constexpr int64_t few = 1 << 13;  // number of particles below which one thread is faster than a team
-  const cpu::Alone alone(particles < few);
-  if (particles < few) return work();
-  cpu::with_team([](void* w) { (*static_cast<const Work*>(w))(); }, const_cast<Work*>(&work));
-}
-
-#else
-
-template <class Work>
-void with_team(int64_t, const Work& work) {
-  work();
-}
 
 // Captures the graphs of a thread, and stores the latest one. The next graph mostly differs in its pointers only, and
 // an update of these takes a third of the time of a new graph. It has a separate stream, since torch's default stream
@@ -206,8 +185,6 @@ std::vector<T> on_host(const T* values, int64_t count, cudaStream_t stream) {
   STD_TORCH_CHECK(cudaStreamSynchronize(stream) == cudaSuccess, "CUDA: ", cudaGetErrorString(cudaGetLastError()));
   return copy;
 }
-#endif
-
 #endif
 
 }  // namespace mpm

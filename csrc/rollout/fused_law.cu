@@ -1,0 +1,251 @@
+// Fused kernels of the laws of one header, MPM_LAW_HEADER: the law is evaluated as P2G loads a particle.
+#define MPM_REGISTER_LAW(Law) static const bool Law##_is_fused = cuda::enter_fused<Law>();
+
+#include "rollout/fused_law.h"
+#include "rollout/schedules/block_per_scene.cuh"
+#include "rollout/schedules/fused_g2p2g.cuh"
+#include "rollout/schedules/persistent.cuh"
+
+namespace mpm::cuda {
+
+// Entries of the history of a law, side by side, if all of it is there.
+template <class Law, int D>
+constexpr int history_entries() {
+  int entries = 0;
+  for (const Quantity& variable : Law::history) entries += variable.matrix ? D * D : 1;
+  return entries;
+}
+
+// The history variable of an entry.
+template <class Law, int D>
+constexpr int history_variable(int entry) {
+  int variable = 0;
+  for (const Quantity& q : Law::history) {
+    entry -= q.matrix ? D * D : 1;
+    if (entry < 0) break;
+    variable++;
+  }
+  return variable;
+}
+
+// Momentum of particles whose stress is computed as they are loaded, and stored where it has a destination. Where
+// requested, F or J is updated first if the previous G2P has deferred the update.
+template <class Law, class T, int D, bool MayMove>
+struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true> {
+  using Base = MomentumSource<2, T, D, Stress::moment, true>;
+  using Kernels = typename Law::template Kernels<Law>;
+  static constexpr bool moves_F = Law::field == Deformation::gradient;
+  static constexpr int resident = Law::gpu_p2g_blocks, entries = history_entries<Law, D>();
+  LawUpdateArguments<T, D> law;
+  LateDeformation<T, D> late;
+  Columns<const T, moves_F ? D * D : 1> state;  // F or J, as given
+  Columns<T, moves_F ? D * D : 1> kept;         // and their destination; optional
+
+  // Result of the law at a particle.
+  struct Changes {
+    Matrix<T, D> F;
+    T J, history[entries > 0 ? entries : 1];
+  };
+  struct Parameters {
+    T value[kParameters<Law>];
+  };
+
+  LawMomentumSource(const P2GArguments<T, D>& a, const LawUpdateArguments<T, D>& law,
+                    const LateDeformation<T, D>& late = {})
+      : Base(a), law(law), late(late), state(law.law.state, D), kept(Law::plastic ? law.state : late.state, D) {}
+
+  // Inputs of the law at a particle, except its history.
+  __device__ void fetch(int p, Changes& changes) const {
+    if constexpr (!moves_F) {
+      changes.J = state.at(p);
+      return;
+    }
+#pragma unroll
+    for (int k = 0; k < D * D; k++) changes.F[k / D][k % D] = state.at(p, k);
+  }
+  __device__ Parameters parameters(int p) const {
+    Parameters r;
+#pragma unroll
+    for (int k = 0; k < kParameters<Law>; k++) r.value[k] = load_parameter(One<T>{p}, law.law, k);
+    return r;
+  }
+  // Stress from the loaded inputs, which become the values to be stored.
+  __device__ Matrix<T, D> stress(int p, const Matrix<T, D>& C, const T& dt, const Parameters& parameters,
+                                 Changes& changes) const {
+    const One<T> at{p};
+    Matrix<T, D> stress;
+    LawUpdateArguments<T, D> a = law;
+    a.stress = {&stress[0][0], {0, D, 1}};
+#pragma unroll
+    for (int k = 0; k < kParameters<Law>; k++) a.law.parameters[k] = {&parameters.value[k]};
+    if (Law::viscous && Base::fields.affine.present()) a.law.C = {&C[0][0], {0, D, 1}};
+    if constexpr (moves_F) {
+      if (late.moves) changes.F = advance_deformation(changes.F, C, dt);
+      a.law.state = {&changes.F[0][0], {0, D, 1}};
+      if (Law::plastic) a.state = {&changes.F[0][0], {0, D, 1}};
+    } else {
+      if (late.moves) changes.J = advance_volume_ratio(changes.J, C, dt);
+      a.law.state = {&changes.J, {0}};
+    }
+    if (entries > 0 && law.history.pointer) a.history = {changes.history, {0, 1}};
+    Kernels::update(a, at);
+    if (law.stress.pointer) store_matrix<D>(at, law.stress, stress);
+    return stress;
+  }
+  __device__ Matrix<T, D> evaluate(int p, const Matrix<T, D>& C, const T& dt, Changes& changes) const {
+    fetch(p, changes);
+    return stress(p, C, dt, parameters(p), changes);
+  }
+  __device__ void keep(int p, const Changes& changes) const {
+    if (kept.present()) {
+      if constexpr (!moves_F) kept.at(p) = changes.J;
+#pragma unroll
+      for (int k = 0; moves_F && k < D * D; k++) kept.at(p, k) = changes.F[k / D][k % D];
+    }
+    if (!law.history.pointer) return;
+#pragma unroll
+    for (int k = 0; k < entries; k++) {  // options decide how much of its history a law has: the first variables
+      if (law.law.history[history_variable<Law, D>(k)].pointer)
+        store_entry(One<T>{p}, law.history, k, changes.history[k]);
+    }
+  }
+  __device__ Matrix<T, D> update(int p, const Matrix<T, D>& C, const T& dt) const {
+    if constexpr (MayMove) {
+      Changes changes;
+      const Matrix<T, D> stress = evaluate(p, C, dt, changes);
+      keep(p, changes);
+      return stress;
+    } else {
+      Matrix<T, D> stress;
+      LawUpdateArguments<T, D> a = law;
+      a.stress = {&stress[0][0], {0, D, 1}};
+      Kernels::update(a, One<T>{p});
+      if (law.stress.pointer) store_matrix<D>(One<T>{p}, law.stress, stress);
+      return stress;
+    }
+  }
+  __device__ ParticleMomentum<T, D> load(int p, int scene) const {
+    ParticleMomentum<T, D> m = read(p, scene, p);
+    m.stress = update(p, m.affine, m.dt);
+    return m;
+  }
+  // Its stress is still zero; `of_motion` is the row of its velocity and affine field.
+  __device__ ParticleMomentum<T, D> read(int p, int scene, int of_motion) const {
+    ParticleMomentum<T, D> m = Base::fields.read_at_rest(p, Base::fields.time_step(scene));
+    Base::fields.read_motion(of_motion, m);
+    return m;
+  }
+  // Outside the grid, where F has to be updated once more after the particle has left; then its affine field is zero.
+  // For a position that is not finite it may be NaN, and F is unchanged.
+  __device__ void skip(int p) const {
+    const auto m = read(p, scene_of_late(p), p);
+    const bool finite = is_finite<D>(read_vector(Base::position, p).e);
+    update(p, finite ? m.affine : zero_matrix<T, D>(), m.dt);
+  }
+  __device__ void skip_at_rest(int p) const {
+    update(p, zero_matrix<T, D>(), Base::fields.time_step(scene_of_late(p)));
+  }
+
+ protected:
+  __device__ int scene_of_late(int p) const {
+    const int scene = late.scene ? late.scene[p * late.scene_stride] : 0;
+    return unsigned(scene) < unsigned(Base::topology.scenes) ? scene : 0;
+  }
+};
+
+// The same for particles that P2G also moves into the order of its items, if the call owns them.
+template <class Law, class T, int D>
+struct ReorderingSource : LawMomentumSource<Law, T, D, true> {
+  using Base = LawMomentumSource<Law, T, D, true>;
+  ReorderOnScatter<T, D> reorder;
+
+  ReorderingSource(const P2GArguments<T, D>& a, const LawUpdateArguments<T, D>& law, const LateDeformation<T, D>& late,
+                   const ReorderOnScatter<T, D>& reorder)
+      : Base(a, law, late), reorder(reorder) {}
+
+  bool is_mostly_idle() const { return reorder.rows > 0 && reorder.is_mostly_idle(); }
+  __device__ bool is_due() const { return reorder.rows == 0 || reorder.is_due(Base::topology.particles); }
+  __device__ bool reorders() const { return reorder.rows > 0; }
+  __device__ ParticleMomentum<T, D> load(int p, int scene, int place) const {
+    ParticleMomentum<T, D> m = Base::read(p, scene, reorder.rows ? reorder.place(p) : p);
+    take(p, place, m, m.affine, m.stress);
+    return m;
+  }
+  __device__ void skip(int p, int place) const {
+    ParticleMomentum<T, D> m = Base::read(p, Base::scene_of_late(p), reorder.rows ? reorder.place(p) : p);
+    const bool finite = is_finite<D>(read_vector(Base::position, p).e);
+    take(p, place, m, finite ? m.affine : zero_matrix<T, D>(), m.stress);
+  }
+
+ private:
+  __device__ void take(int p, int place, const ParticleMomentum<T, D>& m, const Matrix<T, D>& C,
+                       Matrix<T, D>& stress) const {
+    typename Base::Changes changes;
+    stress = Base::evaluate(p, C, m.dt, changes);
+    const int to = reorder.rows ? reorder.in_other_copy(p, place) : p;
+    Base::keep(to, changes);
+    if (reorder.rows) write_reordered(p, place, to, m);
+  }
+  __device__ void write_reordered(int p, int place, int to, const ParticleMomentum<T, D>& m) const {
+    const One<T> at{to};
+    store_vector<D>(at, reorder.x, read_vector(Base::position, p));
+    store_scalar(at, reorder.mass, m.mass);
+    store_scalar(at, reorder.volume, m.volume);
+    if (reorder.residual.pointer)
+      store_vector<D>(at, reorder.residual, load_vector<D>(One<T>{p}, reorder.residual_before));
+    reorder.origin[to] = reorder.given ? p : reorder.origin[p];
+    reorder.index[place] = to;
+    if (place == 0) *reorder.copy = to >= reorder.rows;
+  }
+};
+
+// In float only: in double the kernels would need all registers.
+template <class Law, int D>
+struct FusedLaunches {
+  static void p2g(const LawUpdateArguments<float, D>& law, const LateDeformation<float, D>& late,
+                  const P2GArguments<float, D>& a, const ReorderOnScatter<float, D>& reorder, void* stream) {
+    launch_scatter(ReorderingSource<Law, float, D>(a, law, late, reorder), false, static_cast<Stream>(stream));
+  }
+  static void g2p2g(const LawUpdateArguments<float, D>& law, const G2P2GArguments<float, D>& a, void* stream) {
+    launch_g2p2g(LawMomentumSource<Law, float, D, true>(a.p2g, law, a.late),
+                 AdvanceGather<2, float, D, false, true, false>(a.advance), a, static_cast<Stream>(stream));
+  }
+#if CUDART_VERSION >= 13000
+  static void persistent(const LawUpdateArguments<float, D>& law, const PersistentArguments<float, D>& a,
+                         void* stream) {
+    launch_persistent(LawMomentumSource<Law, float, D, true>(a.p2g, law, a.late),
+                      AdvanceGather<2, float, D, false, true, false>(a.advance), a, static_cast<Stream>(stream));
+  }
+#endif
+  static void block_per_scene(const LawUpdateArguments<float, D>& law, const BlockPerSceneArguments<float, D>& a,
+                              void* stream) {
+    launch_block_per_scene(LawMomentumSource<Law, float, D, false>(a.p2g, law),
+                           AdvanceGather<2, float, D, false, false>(a.advance), a, static_cast<Stream>(stream));
+  }
+};
+
+template <class Law, int D>
+void fill_fused(FusedLawKernels<float, D>& kernels) {
+  using Launches = FusedLaunches<Law, D>;
+  kernels.p2g = Launches::p2g;
+  kernels.g2p2g = Launches::g2p2g;
+#if CUDART_VERSION >= 13000
+  kernels.persistent = Launches::persistent;
+#endif
+  kernels.block_per_scene = Launches::block_per_scene;
+}
+
+// Only laws that are the only one of a material have fused kernels.
+template <class Law>
+bool enter_fused() {
+  if constexpr (!Law::additive) {
+    FusedLaw& law = fused_laws()[Law::name];
+    fill_fused<Law, 3>(law.in_3d);
+    if constexpr (Law::in_2d) fill_fused<Law, 2>(law.in_2d);
+  }
+  return true;
+}
+
+}  // namespace mpm::cuda
+
+#include MPM_LAW_HEADER
