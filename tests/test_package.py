@@ -3,6 +3,7 @@
 import ast
 import json
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -43,20 +44,46 @@ def test_library_exports_none_of_its_functions(library: Path) -> None:
     assert [name for name in symbols(library, "--defined-only") if "mpm::" in name] == []
 
 
-@pytest.mark.skipif(shutil.which("objdump") is None, reason="objdump is not installed")
-@pytest.mark.skipif(platform.machine() != "x86_64", reason="other processors have one instruction-set level")
-def test_only_code_of_the_avx_levels_uses_avx() -> None:
-    """An inline function merged across levels must be the one that every x86-64 processor can run."""
+AVX_NAMES = "avx2", "avx512"
+"""Part of the name of each function of a level above the baseline."""
+
+
+@pytest.fixture(scope="module")
+def functions() -> list[tuple[str, list[str]]]:
+    """Functions of the CPU library, with their instructions."""
+    if shutil.which("objdump") is None:
+        pytest.skip("objdump is not installed")
+    if platform.machine() != "x86_64":
+        pytest.skip("other processors have one instruction-set level")
     command = ["objdump", "--disassemble", "--demangle", "--no-show-raw-insn", str(_library.CPU_LIBRARY)]
-    lines = subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()
-    function, avx = "", set()
-    for line in lines:
+    found: list[tuple[str, list[str]]] = []
+    for line in subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines():
         if line.endswith(">:"):
-            function = line
-        elif "%ymm" in line or "%zmm" in line:
-            avx.add(function)
-    assert bool(avx) == bool({"avx2", "avx512"} & set(info()["build"]["cpu"]["isa"]))
-    assert [name for name in avx if "avx2" not in name and "avx512" not in name] == []
+            found.append((line, []))
+        elif found and "\t" in line:
+            found[-1][1].append(line)
+    return found
+
+
+def of_avx(name: str) -> bool:
+    return any(level in name for level in AVX_NAMES)
+
+
+def test_only_code_of_the_avx_levels_uses_avx(functions: list[tuple[str, list[str]]]) -> None:
+    """An inline function merged across levels must be the one that every x86-64 processor can run."""
+    avx = {name for name, lines in functions if any("%ymm" in line or "%zmm" in line for line in lines)}
+    assert bool(avx) == bool(set(AVX_NAMES) & set(info()["build"]["cpu"]["isa"]))
+    assert [name for name in avx if not of_avx(name)] == []
+
+
+def test_code_that_runs_at_load_uses_no_avx(functions: list[tuple[str, list[str]]]) -> None:
+    """A processor without AVX-512 loads the library too: initialisers of its levels may not call their code."""
+    names = "<_GLOBAL__sub_I_", "__static_initialization_and_destruction"
+    initialisers = [(name, lines) for name, lines in functions if any(part in name for part in names)]
+    assert len(initialisers) > len(AVX_NAMES)  # laws register themselves
+    for name, lines in initialisers:
+        wrong = [line for line in lines if re.search(r"%[yz]mm|\tv[a-z]", line) or ("call" in line and of_avx(line))]
+        assert wrong == [], name
 
 
 def test_info_describes_build_and_devices() -> None:

@@ -1,6 +1,7 @@
 // CPU loops of the laws of one header, MPM_LAW_HEADER.
-#define MPM_REGISTER_LAW(Law) \
-  static const bool Law##_is_entered = enter<cpu::LawLoops, Law>(int(cpu::Level::TORCH_MPM_ISA));
+#define MPM_REGISTER_LAW(Law)                                                                           \
+  static constinit LawEntry Law##_entry = entry_of<cpu::LawLoops, Law>(int(cpu::Level::TORCH_MPM_ISA)); \
+  static const bool Law##_is_entered = enter_law(Law##_entry);
 
 #include "cpu/isa.h"
 #include "cpu/lanes.h"

@@ -1,5 +1,7 @@
 // CUDA kernels of the laws of one header, MPM_LAW_HEADER: one thread per particle.
-#define MPM_REGISTER_LAW(Law) static const bool Law##_is_entered = enter<cuda::LawLaunches, Law>(0);
+#define MPM_REGISTER_LAW(Law)                                                  \
+  static constinit LawEntry Law##_entry = entry_of<cuda::LawLaunches, Law>(0); \
+  static const bool Law##_is_entered = enter_law(Law##_entry);
 
 #include "cuda/programmatic_launch.cuh"
 #include "laws/registry.h"

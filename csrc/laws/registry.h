@@ -1,12 +1,13 @@
 #pragma once
 
+#include <span>
 #include <string>
-#include <vector>
 
 #include "laws/law.h"
 
 // Registry of the compiled laws with their kernels. Each object file of laws/law.cpu.cpp and laws/law.cu registers its
-// laws when the library is loaded; ops find them by name, and Python reads the whole list.
+// laws when the library is loaded; ops find them by name, and Python reads the whole list. Entries are constants, so
+// that objects of all instruction sets can be loaded: none of their code runs before the best one is chosen.
 namespace mpm {
 
 struct LawInfo {
@@ -14,8 +15,8 @@ struct LawInfo {
   Deformation field = Deformation::gradient;
   bool viscous = false, plastic = false, optional_history = false, twice_differentiable = false,
        twice_differentiable_energy = false, has_tangent = false, in_2d = true, additive = false;
-  std::vector<Quantity> parameters, history;
-  std::vector<const char*> options;
+  std::span<const Quantity> parameters, history;
+  std::span<const char* const> options;
 
   bool changes() const { return plastic || !history.empty(); }  // deformation or history
 };
@@ -56,8 +57,8 @@ struct LawEntry {
   }
 };
 
-// Registers a law, or further kernels of a registered one.
-LawEntry& enter_law(const LawInfo& info, int level);
+// Registers a law.
+bool enter_law(LawEntry& law);
 
 // Null where the name is unknown for the instruction set in use.
 LawEntry* find_law(const std::string& name);
@@ -69,7 +70,7 @@ std::string law_names();
 inline namespace TORCH_MPM_ISA {
 
 template <class Law>
-LawInfo info_of() {
+constexpr LawInfo info_of() {
   return {Law::name,
           Law::field,
           Law::viscous,
@@ -80,21 +81,21 @@ LawInfo info_of() {
           Law::has_tangent,
           Law::in_2d,
           Law::additive,
-          {Law::parameters.begin(), Law::parameters.end()},
-          {Law::history.begin(), Law::history.end()},
-          {Law::options.begin(), Law::options.end()}};
+          Law::parameters,
+          Law::history,
+          Law::options};
 }
 
 // Kernels<Law, T, D> has the functions of LawKernels as static members.
 template <template <class, class, int> class Kernels, class Law, class T, int D>
-void fill_kernels(LawEntry& entry) {
+constexpr LawKernels<T, D> all_kernels() {
   static_assert(kParameters<Law> <= kMostParameters && kHistory<Law> <= kMostHistory);
   static_assert(kChangesNothing<Law> || (!Law::viscous && Law::field == Deformation::gradient),
                 "rollout/substeps_backward.op.cpp has no term for it");
   static_assert(!Law::additive || kChangesNothing<Law>, "only what changes nothing can be beside another law");
+  LawKernels<T, D> kernels;
   if constexpr (D == 3 || Law::in_2d) {
     using K = Kernels<Law, T, D>;
-    LawKernels<T, D>& kernels = entry.template kernels<T, D>();
     kernels.update = K::update;
     kernels.update_backward = K::update_backward;
     kernels.scalar = K::scalar;
@@ -103,16 +104,17 @@ void fill_kernels(LawEntry& entry) {
     if constexpr (Law::twice_differentiable) kernels.double_backward = K::double_backward;
     if constexpr (Law::twice_differentiable_energy) kernels.energy_double_backward = K::energy_double_backward;
   }
+  return kernels;
 }
 
 template <template <class, class, int> class Kernels, class Law>
-bool enter(int level) {
-  LawEntry& entry = enter_law(info_of<Law>(), level);
-  fill_kernels<Kernels, Law, float, 2>(entry);
-  fill_kernels<Kernels, Law, float, 3>(entry);
-  fill_kernels<Kernels, Law, double, 2>(entry);
-  fill_kernels<Kernels, Law, double, 3>(entry);
-  return true;
+constexpr LawEntry entry_of(int level) {
+  return {info_of<Law>(),
+          level,
+          all_kernels<Kernels, Law, float, 2>(),
+          all_kernels<Kernels, Law, float, 3>(),
+          all_kernels<Kernels, Law, double, 2>(),
+          all_kernels<Kernels, Law, double, 3>()};
 }
 
 }  // namespace TORCH_MPM_ISA

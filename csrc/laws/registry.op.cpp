@@ -1,9 +1,8 @@
 #include "laws/registry.h"
 
 #include <cmath>
-#include <cstring>
-#include <deque>
 #include <sstream>
+#include <vector>
 
 #include "common/backend.h"
 
@@ -11,8 +10,8 @@ namespace mpm {
 namespace {
 
 // In a function, since a global would not yet be constructed when the first law is registered.
-std::deque<LawEntry>& entered() {
-  static std::deque<LawEntry> laws;
+std::vector<LawEntry*>& entered() {
+  static std::vector<LawEntry*> laws;
   return laws;
 }
 
@@ -63,30 +62,28 @@ std::string law_as_json(const LawInfo& info) {
 
 }  // namespace
 
-LawEntry& enter_law(const LawInfo& info, int level) {
-  for (LawEntry& law : entered())
-    if (law.level == level && std::strcmp(law.info.name, info.name) == 0) return law;
-  entered().push_back({info, level, {}, {}, {}, {}});
-  return entered().back();
+bool enter_law(LawEntry& law) {
+  entered().push_back(&law);
+  return true;
 }
 
 LawEntry* find_law(const std::string& name) {
-  for (LawEntry& law : entered())
-    if (law.level == level_in_use() && name == law.info.name) return &law;
+  for (LawEntry* law : entered())
+    if (law->level == level_in_use() && name == law->info.name) return law;
   return nullptr;
 }
 
 std::string law_names() {
   std::string names;
-  for (const LawEntry& law : entered())
-    if (law.level == level_in_use()) names += (names.empty() ? "" : ", ") + std::string(law.info.name);
+  for (const LawEntry* law : entered())
+    if (law->level == level_in_use()) names += (names.empty() ? "" : ", ") + std::string(law->info.name);
   return names;
 }
 
 std::string laws_as_json() {
   std::vector<LawInfo> infos;
-  for (const LawEntry& law : entered())
-    if (law.level == level_in_use()) infos.push_back(law.info);
+  for (const LawEntry* law : entered())
+    if (law->level == level_in_use()) infos.push_back(law->info);
   return json_list(infos, law_as_json);
 }
 
