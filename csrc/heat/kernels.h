@@ -3,6 +3,7 @@
 #include "common/backend.h"
 #include "heat/patches.h"
 #include "heat/solve.h"
+#include "heat/transfer.h"
 
 #define MPM_HEAT_KERNELS(PLAIN, ORDERED, SIZE)         \
   SIZE(heat_workspace, HeatArguments)                  \
@@ -12,3 +13,14 @@
   ORDERED(heat_stencil, HeatOperatorArguments)         \
   PLAIN(heat_patches, PatchArguments)
 MPM_BACKEND_KERNELS(MPM_HEAT_KERNELS)
+
+#if MPM_BACKEND == MPM_BACKEND_IS_cpu
+#define MPM_HEAT_TRANSFER_KERNELS(PLAIN, ORDERED, SIZE) \
+  PLAIN(heat_volumes, HeatVolumesArguments)             \
+  ORDERED(heat_to_nodes, HeatToNodesArguments)          \
+  PLAIN(heat_means, HeatMeansArguments)                 \
+  PLAIN(heat_largest, HeatLargestArguments)             \
+  PLAIN(heat_increments, HeatIncrementsArguments)       \
+  ORDERED(heat_to_particles, HeatToParticlesArguments)
+MPM_BACKEND_KERNELS(MPM_HEAT_TRANSFER_KERNELS)
+#endif

@@ -15,6 +15,9 @@ namespace mpm {
 
 enum class HeatMethod { conjugate_gradients, chebyshev };
 
+// Residual [K] that a solve may always leave, NEGLIGIBLE in torch_mpm/heat/heat.py.
+constexpr double kNegligibleResidual = 1e-12;
+
 template <class T, int D>
 struct HeatArguments {
   Topology<T, D> topology;
@@ -32,6 +35,7 @@ struct HeatArguments {
   int most = 0;                        // maximum number of iterations, replaced by scene_most where given
   const int* scene_most = nullptr;     // [scenes]
   HeatMethod method = HeatMethod::conjugate_gradients;
+  const double* scene_bound = nullptr;  // [scenes], of the spectrum of H in units of M/dt + X, where it is known (CPU)
   bool deterministic = false;
   T* increment = nullptr;     // [N]
   int* iterations = nullptr;  // [scenes], as those below

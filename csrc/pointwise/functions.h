@@ -8,7 +8,7 @@
 namespace mpm {
 inline namespace TORCH_MPM_ISA {
 
-using PointwiseFunctions = std::tuple<HeatWeights, HeatMoments<1>, HeatMoments<2>, HeatMeans<1>, HeatMeans<2>,
+using PointwiseFunctions = std::tuple<HeatWeightsOfParticle, HeatMoments<1>, HeatMoments<2>, HeatMeans<1>, HeatMeans<2>,
                                       HeatUpdate<1>, HeatUpdate<2>, HeatMelt, HeatLayer, HeatExchange, HeatRadiation,
                                       SurfaceNormals, Length, BoxDistance, ThermalStretch, MeltingParts, MeltingStress>;
 

@@ -1,27 +1,15 @@
 #pragma once
 
+#include "heat/particle.h"
 #include "pointwise/function.h"
 
 // Pointwise parts of a step of heat at particles and nodes (torch_mpm/heat).
 namespace mpm {
 inline namespace TORCH_MPM_ISA {
 
-template <class T>
-MPM_HD T clamp_to_unit(const T& a) {
-  return select(a > T(1), T(1), select(a < T(0), T(0), a));
-}
-
-// Length with derivative zero at the zero vector, from its square.
-template <class T>
-MPM_HD T safe_root(const T& squared) {
-  const auto positive = squared > T(0);
-  return select(positive, sqrt(select(positive, squared, T(1))), T(0));
-}
-
 // Rest volume, J, F (either is the number one where the other gives the volume), C, κ, mass, dt, ∇v, dx to the present
-// volume V, heat capacity m C, conductance κ V, the blend β = min(1, 4 r + dt |sym ∇v|), and the diffusion number r.
-// Where matter is strained, the gradient of the particle relaxes to that of the grid.
-struct HeatWeights {
+// volume V, heat capacity m C, conductance κ V, the blend β, and the diffusion number r.
+struct HeatWeightsOfParticle {
   static constexpr const char* name = "heat_weights";
   static constexpr Entries arguments[] = {kScalar, kScalar, kMatrix, kScalar, kScalar,
                                           kScalar, kScalar, kMatrix, kScalar};
@@ -31,24 +19,14 @@ struct HeatWeights {
   MPM_HD static void evaluate(Reader<T, D>& in, Writer<T, D>& out) {
     const T rest = in.scalar(), J = in.scalar();
     const T volume = rest * J * determinant(in.matrix());
-    const T specific_heat = in.scalar(), given = in.scalar(), mass = in.scalar(), dt = in.scalar();
+    const T specific_heat = in.scalar(), conductivity = in.scalar(), mass = in.scalar(), dt = in.scalar();
     const Matrix<T, D> L = in.matrix();
-    const T dx = in.scalar();
-    const T conductivity = select(given >= T(0), given, T(NAN));
-    const T capacity = specific_heat * mass, conductance = conductivity * volume;
-    T squared = T(0);
-    MPM_UNROLL for (int i = 0; i < D; i++) MPM_UNROLL
-      for (int j = 0; j < D; j++) {
-        const T strain = T(0.5) * (L[i][j] + L[j][i]);
-        squared = squared + strain * strain;
-      }
-    const T r = dt * conductance / (select(capacity > T(0), capacity, T(1)) * dx * dx);
-    const T rate = T(4) * r + dt * safe_root(squared);
+    const HeatWeights<T> w = heat_weights<T, D>(volume, specific_heat, conductivity, mass, dt, L, in.scalar());
     out.put(volume);
-    out.put(capacity);
-    out.put(conductance);
-    out.put(select(rate > T(1), T(1), rate));
-    out.put(r);
+    out.put(w.capacity);
+    out.put(w.conductance);
+    out.put(w.blend);
+    out.put(w.number);
   }
 };
 
@@ -112,7 +90,7 @@ struct HeatUpdate {
   template <class T>
   MPM_HD static T blended(const T (&change)[Channels], const T& before, const T& blend) {
     if constexpr (Channels == 2)
-      return before + change[0] + blend * (change[1] - before);
+      return mpm::blended(change[0], change[1], before, blend);
     else
       return (T(1) - blend) * before + change[0];
   }
@@ -131,17 +109,14 @@ struct HeatUpdate {
     const Matrix<T, D> L = in.matrix();
     const T dt = in.scalar();
     out.put(blended(value, theta, blend));
-    Vector<T, D> after, first, second;
+    Vector<T, D> after;
     MPM_UNROLL for (int i = 0; i < D; i++) {
       T change[Channels];
       MPM_UNROLL for (int k = 0; k < Channels; k++)
         change[k] = moment[k][i];
       after[i] = blended(change, g[i], blend);
     }
-    first = dt * (transpose(L) * after);
-    second = dt * (transpose(L) * first);
-    MPM_UNROLL for (int i = 0; i < D; i++)
-      out.put(after[i] - first[i] + second[i]);
+    out.put(transported_gradient(after, L, dt));
   }
 };
 
@@ -154,12 +129,12 @@ struct HeatMelt {
 
   template <class T, int D>
   MPM_HD static void evaluate(Reader<T, D>& in, Writer<T, D>& out) {
-    const T theta = in.scalar(), before = in.scalar(), melting_point = in.scalar();
-    const T specific_heat = in.scalar(), ratio = specific_heat / in.scalar(), r = in.scalar();
-    const T liquid = clamp_to_unit(before + ratio * (theta - melting_point));
-    out.put(theta - (liquid - before) / ratio);
+    T theta = in.scalar(), liquid = in.scalar();
+    const T melting_point = in.scalar(), specific_heat = in.scalar(), latent_heat = in.scalar(), r = in.scalar();
+    const T changing = melt(theta, liquid, melting_point, specific_heat, latent_heat, r);
+    out.put(theta);
     out.put(liquid);
-    out.put(select(liquid > before, r, select(liquid < before, r, T(0))));
+    out.put(changing);
   }
 };
 

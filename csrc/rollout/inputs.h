@@ -10,53 +10,58 @@
 namespace mpm {
 
 // The arguments of a call: a kind, the name in the schema, and the member of SubstepsInputs. The only list of them.
-#define MPM_SUBSTEPS_LIST(FIRST, X)             \
-  FIRST(TENSOR, x, x)                           \
-  X(TENSOR, v, v)                               \
-  X(TENSOR, mass, mass)                         \
-  X(TENSOR, volume, volume)                     \
-  X(OPTIONAL, C, C)                             \
-  X(OPTIONAL, F, F)                             \
-  X(OPTIONAL, J, J)                             \
-  X(OPTIONAL, residual, residual)               \
-  X(TENSORS, history, history)                  \
-  X(OPTIONAL, scene, scene)                     \
-  X(OPTIONAL, ids, ids)                         \
-  X(OPTIONAL, material, material)               \
-  X(OPTIONAL, previous_status, previous_status) \
-  X(STRING, laws, laws)                         \
-  X(INTS, options, options)                     \
-  X(TENSORS, parameters, parameters)            \
-  X(INTS, variables, variables)                 \
-  X(INT, n, n)                                  \
-  X(FLOAT, dt, dt)                              \
-  X(BOOL, apic, apic)                           \
-  X(FLOAT, flip, flip)                          \
-  X(BOOL, wants_C, wants_C)                     \
-  X(INT, stress_form, stress_form)              \
-  X(OPTIONAL, gravity, gravity)                 \
-  X(INTS, wall_kind, wall_kind)                 \
-  X(FLOATS, wall_plane, wall_plane)             \
-  X(FLOATS, wall_friction, wall_friction)       \
-  X(OPTIONAL, obstacles, obstacle_table)        \
-  X(OPTIONAL, data, obstacle_data)              \
-  X(INTS, shape, shape)                         \
-  X(INTS, sizes, sizes)                         \
-  X(INTS, contact, contact_kind)                \
-  X(INTS, obstacle_scene, obstacle_scene)       \
-  X(FLOATS, start, start)                       \
-  X(FLOATS, end, end)                           \
-  X(FLOAT, time, time)                          \
-  X(INT, scenes, scenes)                        \
-  X(INT, max_blocks, max_blocks)                \
-  X(BOOL, grows, grows)                         \
-  X(BOOL, resident, resident)                   \
-  X(BOOL, records, records)                     \
-  X(OPTIONAL, impulse, impulse)                 \
-  X(OPTIONAL, scene_dt, scene_dt)               \
-  X(OPTIONAL, scene_time, scene_time)           \
-  X(FLOATS, lattice, lattice_numbers)           \
-  X(INTS, layout, lattice_layout)               \
+#define MPM_SUBSTEPS_LIST(FIRST, X)                       \
+  FIRST(TENSOR, x, x)                                     \
+  X(TENSOR, v, v)                                         \
+  X(TENSOR, mass, mass)                                   \
+  X(TENSOR, volume, volume)                               \
+  X(OPTIONAL, C, C)                                       \
+  X(OPTIONAL, F, F)                                       \
+  X(OPTIONAL, J, J)                                       \
+  X(OPTIONAL, residual, residual)                         \
+  X(TENSORS, history, history)                            \
+  X(OPTIONAL, scene, scene)                               \
+  X(OPTIONAL, ids, ids)                                   \
+  X(OPTIONAL, material, material)                         \
+  X(OPTIONAL, previous_status, previous_status)           \
+  X(STRING, laws, laws)                                   \
+  X(INTS, options, options)                               \
+  X(TENSORS, parameters, parameters)                      \
+  X(INTS, variables, variables)                           \
+  X(INT, n, n)                                            \
+  X(FLOAT, dt, dt)                                        \
+  X(BOOL, apic, apic)                                     \
+  X(FLOAT, flip, flip)                                    \
+  X(BOOL, wants_C, wants_C)                               \
+  X(INT, stress_form, stress_form)                        \
+  X(OPTIONAL, gravity, gravity)                           \
+  X(INTS, wall_kind, wall_kind)                           \
+  X(FLOATS, wall_plane, wall_plane)                       \
+  X(FLOATS, wall_friction, wall_friction)                 \
+  X(OPTIONAL, obstacles, obstacle_table)                  \
+  X(OPTIONAL, data, obstacle_data)                        \
+  X(INTS, shape, shape)                                   \
+  X(INTS, sizes, sizes)                                   \
+  X(INTS, contact, contact_kind)                          \
+  X(INTS, obstacle_scene, obstacle_scene)                 \
+  X(FLOATS, start, start)                                 \
+  X(FLOATS, end, end)                                     \
+  X(FLOAT, time, time)                                    \
+  X(INT, scenes, scenes)                                  \
+  X(INT, max_blocks, max_blocks)                          \
+  X(BOOL, grows, grows)                                   \
+  X(BOOL, resident, resident)                             \
+  X(BOOL, records, records)                               \
+  X(OPTIONAL, impulse, impulse)                           \
+  X(OPTIONAL, scene_dt, scene_dt)                         \
+  X(OPTIONAL, scene_time, scene_time)                     \
+  X(TENSORS, heat, heat)                                  \
+  X(OPTIONAL, temperature_gradient, temperature_gradient) \
+  X(INT, heat_transfer, heat_transfer)                    \
+  X(FLOAT, heat_tolerance, heat_tolerance)                \
+  X(INT, heat_iterations, heat_iterations)                \
+  X(FLOATS, lattice, lattice_numbers)                     \
+  X(INTS, layout, lattice_layout)                         \
   X(CHOICE, schedule, schedule)
 
 // For each kind its name in the schema, and the type of a member.
@@ -245,8 +250,9 @@ void set_history(LawArguments<T, D>& a, const LawCall& call, const Field<const T
   }
 }
 
-// The results of a call: x, v, C, F, J, history, status, impulse, time, residual, and the record.
-using Results = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
+// The results of a call: x, v, C, F, J, history, status, impulse, time, residual, heat, its status, and the record.
+using Results =
+    std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
 inline Tensor copy_of(const Tensor& t) {
   Tensor copy = empty(t, sizes_of(t));

@@ -463,6 +463,7 @@ PlanFacts Substeps<T, D>::facts_of_call() const {
   f.gradients = !in.resident;
   f.records = in.records;
   f.obstacles = contact.obstacles;
+  f.heat = !in.heat.empty();
   return f;
 }
 

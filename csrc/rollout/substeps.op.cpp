@@ -42,6 +42,8 @@ std::optional<Results> run_recorded(const SubstepsInputs& in, backend::Stream st
                  Tensor(),
                  has(in.scene_time) ? r.scene_time_after() : Tensor(),
                  copy(has(in.residual), r.residual, &R::vector),
+                 Tensor(),
+                 Tensor(),
                  r.memory()};
 }
 
@@ -49,8 +51,8 @@ std::optional<Results> run_recorded(const SubstepsInputs& in, backend::Stream st
 
 // Results with the given particles, if the pool has no room for the first activation.
 template <class T, int D>
-Results no_step(const SubstepsInputs& in, const Tensor& history, const Tensor& status, const Tensor& impulse,
-                const Tensor& time) {
+Results no_step(const SubstepsInputs& in, const SortedCpu<T, D>& particles, const Tensor& history, const Tensor& status,
+                const Tensor& impulse, const Tensor& time) {
   const auto copy = [&](const OptionalTensor& t, bool wanted, const Shape& shape) {
     Tensor r = result(in.x, wanted, shape);
     if (wanted) has(t) ? torch::stable::copy_(r, *t) : torch::stable::zero_(r);
@@ -67,6 +69,8 @@ Results no_step(const SubstepsInputs& in, const Tensor& history, const Tensor& s
           impulse,
           time,
           copy(in.residual, has(in.residual), {P, D}),
+          particles.heat ? particles.heat->fields.tensor() : Tensor(),
+          particles.heat ? particles.heat->status : Tensor(),
           Tensor()};
 }
 
@@ -95,7 +99,7 @@ Results run_steps(const SubstepsInputs& in, backend::Stream stream) {
     }
     particles.restore_order();
   });
-  if (step == 0) return no_step<T, D>(in, history, status[0], impulse, time);
+  if (step == 0) return no_step<T, D>(in, particles, history, status[0], impulse, time);
   return {particles.x.tensor(),
           particles.v.tensor(),
           particles.C.tensor(),
@@ -106,6 +110,8 @@ Results run_steps(const SubstepsInputs& in, backend::Stream stream) {
           impulse,
           time,
           particles.residual.tensor(),
+          particles.heat ? particles.heat->fields.tensor() : Tensor(),
+          particles.heat ? particles.heat->status : Tensor(),
           Tensor()};
 }
 
@@ -125,6 +131,8 @@ Results run_steps(const SubstepsInputs& in, backend::Stream stream) {
 Results run(const SubstepsInputs& in) {
   const Tensor& x = in.x;
   check_positions(x);
+  STD_TORCH_CHECK(in.heat.empty() || (x.is_cpu() && !in.records && in.resident),
+                  "heat is computed on the CPU, without gradients");
   const DeviceScope device(x);
   if (in.records && !has(in.impulse) && x.size(0) > 0) {
     std::optional<Results> recorded;
@@ -148,7 +156,7 @@ int64_t latest_schedule(const Tensor&) { return schedule_of_latest; }
 STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
   m.def("substeps(" MPM_SUBSTEPS_SCHEMA
         ") -> (Tensor x, Tensor v, Tensor C, Tensor F, Tensor J, Tensor history, Tensor status, Tensor "
-        "impulse, Tensor time, Tensor residual, Tensor record)");
+        "impulse, Tensor time, Tensor residual, Tensor heat, Tensor heat_status, Tensor record)");
   m.def("latest_schedule(Tensor like) -> int");
 }
 #endif

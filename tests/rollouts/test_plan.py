@@ -42,6 +42,7 @@ CUDA = Facts(
     graph_loops=True,
     path_bytes=0,
     obstacles=0,
+    heat=False,
 )
 CPU = CUDA._replace(cuda=False, graph_loops=False)
 FEW = CUDA._replace(particles=5000, blocks_per_scene=1000, max_blocks=100)

@@ -37,16 +37,26 @@ class FrontStatus:
         """
         number = without_transforms(number.detach())
         with outside_transforms():
-            if self.largest is None or self.largest.device != number.device or len(self.largest) != scenes:
-                with torch.inference_mode(False):
-                    self.largest = torch.zeros(scenes, dtype=torch.float64, device=number.device)
+            largest = self._of_scenes(scenes, number.device)
             if not scenes or not len(number):
                 return
             if scene is None:
-                torch.maximum(self.largest, number.amax(), out=self.largest)
+                torch.maximum(largest, number.amax(), out=largest)
                 return
             rows = self._scene_rows.get((scene, scenes), lambda: scene.long().clamp(0, scenes - 1), number)
-            self.largest.scatter_reduce_(0, rows, number.to(self.largest.dtype), "amax")
+            largest.scatter_reduce_(0, rows, number.to(largest.dtype), "amax")
+
+    def _of_scenes(self, scenes: int, device: torch.device) -> Tensor:
+        if self.largest is None or self.largest.device != device or len(self.largest) != scenes:
+            with torch.inference_mode(False):
+                self.largest = torch.zeros(scenes, dtype=torch.float64, device=device)
+        return self.largest
+
+    @torch.no_grad()
+    def add_largest(self, numbers: Tensor) -> None:
+        """Count steps, with the largest diffusion number of each scene in them [B]."""
+        largest = self._of_scenes(len(numbers), numbers.device)
+        torch.maximum(largest, numbers, out=largest)
 
     def warn(self) -> None:
         """Warn of fronts with too long steps; waits for the device.

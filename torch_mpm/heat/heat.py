@@ -360,12 +360,24 @@ class Heat(nn.Module):
         """Store the values that `check` reports, on the device."""
         converged, residual = without_transforms(converged), without_transforms(residual)
         with outside_transforms():
-            if self.unsolved is None or self.residual is None or self.unsolved.device != converged.device:
-                with torch.inference_mode(False):
-                    self.unsolved = torch.zeros(converged.shape, dtype=torch.int32, device=converged.device)
-                    self.residual = torch.zeros(residual.shape, dtype=torch.float64, device=residual.device)
-            self.unsolved += ~converged
-            torch.maximum(self.residual, torch.where(converged, self.residual, residual), out=self.residual)
+            self._add(~converged, torch.where(converged, 0, residual))
+
+    def _add(self, unsolved: Tensor, residual: Tensor) -> None:
+        """Count solves of each scene that missed their tolerance, with the largest residuals of these, else zero."""
+        if self.unsolved is None or self.residual is None or self.unsolved.device != unsolved.device:
+            with torch.inference_mode(False):
+                self.unsolved = torch.zeros(unsolved.shape, dtype=torch.int32, device=unsolved.device)
+                self.residual = torch.zeros(residual.shape, dtype=torch.float64, device=residual.device)
+        self.unsolved += unsolved.to(torch.int32)
+        torch.maximum(self.residual, residual.to(self.residual.dtype), out=self.residual)
+
+    @torch.no_grad()
+    def count(self, status: Tensor) -> None:
+        """Add the status of steps in one op, [B, 3]: solves that missed their tolerance, their largest residual [K],
+        and the largest diffusion number at a front."""
+        self._add(status[:, 0], status[:, 1])
+        if self.melts:
+            self.fronts.add_largest(status[:, 2])
 
     def problems(self) -> dict[str, Problem]:
         """Failures of the solves so far, by kind as in `Failures`, without synchronising."""

@@ -3,9 +3,9 @@
     torch.ops.torch_mpm.substeps(x, v, mass, volume, C, F, J, residual, history, scene, ids, material, previous_status,
         laws, options, parameters, variables, n, dt, apic, flip, wants_C, stress_form, gravity, wall_kind, wall_plane,
         wall_friction, obstacles, data, shape, sizes, contact, obstacle_scene, start, end, time, scenes,
-        max_blocks, grows, resident, records, impulse, scene_dt, scene_time, lattice, layout,
-        schedule=-1)
-        -> (x, v, C, F, J, history, status, impulse, time, residual, record)
+        max_blocks, grows, resident, records, impulse, scene_dt, scene_time, heat, temperature_gradient,
+        heat_transfer, heat_tolerance, heat_iterations, lattice, layout, schedule=-1)
+        -> (x, v, C, F, J, history, status, impulse, time, residual, heat, heat_status, record)
 
 `torch_mpm.substeps_arguments(step, state, n, dt)` returns the arguments; docs/training.md has an example.
 
@@ -23,6 +23,13 @@ of a second ahead of the device. With `resident` batches of small scenes may be 
 scene; sums, also those of gradients, may then round differently. With `records` all inputs of the adjoint are stored in
 `record`, opaque bytes, and no step is recomputed, except where impulses are counted or the pool had to grow. `residual`
 is `State.x_residual`; without it positions are not compensated.
+
+Heat is conducted where `heat` is not empty, on the CPU and without gradients: temperature [P], conductivity and
+specific heat, and, for materials that melt, liquid fraction [P], melting point and latent heat; parameters are [], [1],
+[B] or [P]. `heat_transfer` is a number in `TRANSFERS` of torch_mpm.heat, `temperature_gradient` [P, D] belongs to the
+first two. The result `heat` [P, m] has temperature, gradient and liquid fraction in its first columns, `heat_status`
+[B, 3] the number of solves that missed the tolerance, their largest residual [K], and the largest diffusion number of
+particles whose liquid fraction changed.
 
 `schedule` is the number of a schedule in the order of csrc/rollout/plan.h; -1 chooses the fastest. A schedule that does
 not support the call is an error with the reason; its sums may round differently.
@@ -107,8 +114,15 @@ def _fake(
         None if impulse is None else impulse.new_empty(impulse.shape),
         None if given["scene_time"] is None else x.new_empty(scenes, dtype=torch.float64),
         None if residual is None else soa_empty(x, (P, D)),
+        None if not given["heat"] else soa_empty(x, (P, _columns_of_heat(given, D))),
+        None if not given["heat"] else x.new_empty((scenes, 3), dtype=torch.float64),
         _fake_record(x) if given["records"] and impulse is None else None,
     )
+
+
+def _columns_of_heat(given: dict[str, Any], dim: int) -> int:
+    """Temperature, gradient, liquid fraction and present volume."""
+    return 2 + (0 if given["temperature_gradient"] is None else dim) + (len(given["heat"]) > 3)
 
 
 def _fake_record(x: Tensor) -> Tensor:
@@ -165,7 +179,7 @@ def _backward(ctx: Any, *grads: Any) -> Any:
     arguments = (given[name] for name in _SCHEMA)
     op = torch.ops.torch_mpm.substeps_backward
     adjoints = interruptible(dispatch, op, *grads[:6], by_impulse, needs, record, *arguments)
-    found = dict(zip(_ADJOINTS, adjoints, strict=True)) | {"impulse": grads[7]}
+    found = dict(zip(_ADJOINTS, adjoints, strict=True)) | {"impulse": grads[7], "heat": [None] * len(given["heat"])}
     found["history"] = _of_history(found["history"], history, wanted["history"])
     found["parameters"] = _of_parameters(found["parameters"], parameters, wanted["parameters"], given["scene"])
     by_dt = found.pop("dt")
@@ -179,7 +193,7 @@ def _backward(ctx: Any, *grads: Any) -> Any:
         found["gravity"] = dt * change
         if wants_dt:
             found["scene_dt"] = found["scene_dt"] + given["dt"] * (given["gravity"] * change).sum(1)
-    lists = ("history", "parameters")
+    lists = ("history", "parameters", "heat")
     return tuple(found.get(name) if name in lists or wanted[name] is True else None for name in _SCHEMA)
 
 

@@ -56,6 +56,7 @@ class Facts(NamedTuple):
     graph_loops: bool
     path_bytes: int
     obstacles: int
+    heat: bool
 
 
 def facts_of(steps: Steps, state: State, stores_all: bool = False) -> Facts:
@@ -97,6 +98,7 @@ def facts_of(steps: Steps, state: State, stores_all: bool = False) -> Facts:
         x.is_cuda and graph_loops(),
         _path_bytes(step, steps, state) if step.boundaries.entries else 0,
         len(step.boundaries.entries),
+        step.heat is not None,
     )
 
 

@@ -23,6 +23,7 @@ from ..step.pause import paused
 from ..step.step import Step
 from .checkpoints import binomial, offloaded
 from .facts import differentiates, follows_paths
+from .fused_heat import heat_arguments, heat_changes
 from .plan import SCHEDULES, RolloutPlan
 from .reasons import why_not_fused
 from .sorting import STEPS_IN_ORDER, restore_order, sort_particles
@@ -140,6 +141,7 @@ def _arguments(
     law.check_parameters(len(state), grid.scenes)
     calls = law_calls(law, state, dt)
     apic = step.transfer == "apic"
+    wants_C = apic or law.viscous or step.heat is not None
     table, *others = obstacle_arguments(boundaries, state.x, grid.scenes, times)
     of_table = table is not None and table.requires_grad
     with_gradient = torch.is_grad_enabled() and (of_table or differentiates(step, state, dt))
@@ -148,13 +150,13 @@ def _arguments(
         None if state.x_residual is None else state.x_residual.detach(),
         *(calls.history, state.scene, state.ids, calls.material, step._error_status.status_for(state.x)),
         *(calls.names, calls.options, calls.parameters, calls.variables),
-        *(int(n), number, apic, step._flip_share, apic or law.viscous, STRESS_FORMS[step.stress_form]),
+        *(int(n), number, apic, step._flip_share, wants_C, STRESS_FORMS[step.stress_form]),
         _gravity(step, state.x),
         *wall_arguments(step.walls, grid),
         *(table, *others),
         *(0.0 if scene_time is not None else float(state.time), grid.scenes),
         *(pool if blocks is None else max(pool, blocks), grid.grows, not with_gradient, with_gradient and records),
-        *(state.impulse, scene_dt, scene_time, *grid.packed),
+        *(state.impulse, scene_dt, scene_time, *heat_arguments(step.heat, state), *grid.packed),
         -1 if schedule is None else SCHEDULES.index(schedule),
     )
     return arguments, calls.history_names
@@ -167,20 +169,26 @@ def _substeps(
     grid, errors = step.grid, step._error_status
     errors.begin(state, grid.scenes)
     arguments, history_names = _arguments(step, state, n, dt, records, blocks, schedule)
-    x, v, C, F, J, history, status, impulse, time, residual, _ = interruptible(
+    x, v, C, F, J, history, status, impulse, time, residual, heat, heat_status, _ = interruptible(
         dispatch, torch.ops.torch_mpm.substeps, *arguments
     )
     errors.follow(errors.status, status)
     grid.watch(status)
     if status.device.type == "cpu":  # The op has enlarged the pool, or stopped.
         grid.follow(status[0].tolist()[Status.BLOCKS_WANTED if grid.grows else Status.BLOCKS_NOW])
-    extra = _history(state, history_names, history)
+    extra, temperature = _history(state, history_names, history), state.temperature
+    if step.heat is not None:
+        temperature, of_heat = heat_changes(step.heat, state, heat, heat_status)
+        extra |= of_heat
+        C = C if step.transfer == "apic" or step.law.viscous else None
     now = time_after(state.time, dt, n) if time is None else _in_shape(time.detach(), state.time, dt)
     if requires_grad(dt) or requires_grad(state.time):
         known: Any = state.time + n * (dt.double() if isinstance(dt, Tensor) else dt)
         now = now + (known - known.detach())  # Adds the gradient, and not a value.
     residual = None if residual is None else residual.detach()
-    return state.replace(x=x, v=v, C=C, F=F, J=J, extra=extra, time=now, impulse=impulse, x_residual=residual)
+    return state.replace(
+        x=x, v=v, C=C, F=F, J=J, temperature=temperature, extra=extra, time=now, impulse=impulse, x_residual=residual
+    )
 
 
 def _in_shape(times: Tensor, time: float | Tensor, dt: float | Tensor) -> Tensor:

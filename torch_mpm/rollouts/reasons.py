@@ -32,6 +32,7 @@ from ..step.step import Step
 from . import graph_segments
 from .anomaly import detecting
 from .facts import has_mirrors
+from .fused_heat import why_not_fused_heat
 from .graph_replay import LEAST_STEPS
 from .steps import Steps
 
@@ -48,8 +49,8 @@ def why_not_fused(step: Any, state: State, dt: float | Tensor) -> str | None:
         return f"dt is a tensor, but not in {str(x.dtype).removeprefix('torch.')}"
     if (reason := _why_not_eager(x)) is not None:
         return reason
-    if step.heat is not None:
-        return "it conducts heat"
+    if step.heat is not None and (reason := why_not_fused_heat(step, state, dt)) is not None:
+        return reason
     if step.integrator is not None:
         return "it is implicit"
     if step.on_grid is not None:

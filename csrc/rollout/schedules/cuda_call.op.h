@@ -49,7 +49,8 @@ class CudaCall {
   }
 
   Results results() const {
-    return {x_[last_], v_, C_, F_[last_], J_[last_], history_, status_[last_], impulse_, time_, residual_, Tensor()};
+    return {x_[last_], v_,    C_,        F_[last_], J_[last_], history_, status_[last_],
+            impulse_,  time_, residual_, Tensor(),  Tensor(),  Tensor()};
   }
 
  private:

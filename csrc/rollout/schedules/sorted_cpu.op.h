@@ -1,70 +1,21 @@
 #pragma once
 
 #include <limits>
-#include <type_traits>
 
 #include "cpu/schedule.h"
+#include "rollout/heat_steps.h"
+#include "rollout/own_field.cpu.h"
 #include "rollout/step_kernels.h"
 
 // The particles of a call on the CPU. They move in place and are reordered by cell from time to time, so that packs of
 // particles are loads and stores of whole registers. At the end they are restored to the given order.
 namespace mpm {
 
-// A field of the particles, [P, ...]: the given tensor, or one of two buffers.
-template <class E>
-class OwnField {
- public:
-  OwnField() = default;
-  OwnField(const Tensor& x, const Field<const E>& given, Shape shape) : x_(x), shape_(std::move(shape)), now_(given) {}
-  explicit OwnField(const Tensor& own) : x_(own), now_(field<const E>(own)), buffers_{own, {}}, owned_(true) {
-    for (int64_t i = 0; i < own.dim(); i++) shape_.push_back(own.size(i));
-  }
-
-  const Field<const E>& now() const { return now_; }
-  const Tensor& tensor() const { return buffers_[turn_]; }
-
-  // Destination of writes: the other buffer, or the current one.
-  Field<E> next(bool elsewhere) {
-    Tensor& to = buffers_[other(elsewhere)];
-    if constexpr (std::is_same_v<E, int>) {
-      if (!to.defined()) to = empty_int(x_, shape_);
-    } else {
-      if (!to.defined()) to = empty_particles(x_, shape_);
-    }
-    return field<E>(to);
-  }
-  void go(bool elsewhere) {
-    turn_ = other(elsewhere);
-    owned_ = true;
-    now_ = field<const E>(buffers_[turn_]);
-  }
-
-  // Adds its components to a list, with the destination `next(elsewhere)` if they are written.
-  void rows(std::vector<ParticleRow<E>>& list, int first, bool written, bool elsewhere) {
-    const Field<E> to = written ? next(elsewhere) : Field<E>{};
-    const int64_t m = shape_.size() > 1 ? shape_[1] : 1, n = shape_.size() > 2 ? shape_[2] : 1;
-    for (int64_t i = 0; i < m; i++)
-      for (int64_t j = 0; j < n; j++)
-        list.push_back({now_.pointer + i * now_.stride[1] + j * now_.stride[2], now_.stride[0],
-                        written ? to.pointer + i * to.stride[1] + j * to.stride[2] : nullptr,
-                        first < 0 ? -1 : first + int(i * n + j)});
-  }
-
- private:
-  int other(bool elsewhere) const { return owned_ ? (elsewhere ? 1 - turn_ : turn_) : 0; }
-
-  Tensor x_;
-  Shape shape_;
-  Field<const E> now_;
-  Tensor buffers_[2];
-  int turn_ = 0;
-  bool owned_ = false;
-};
-
 template <class T, int D>
 class SortedCpu {
  public:
   OwnField<T> x, v, C, F, J, residual, history;
+  std::optional<HeatSteps<T, D>> heat;
 
   // `sorts`: whether steps may change the order of the particles.
   SortedCpu(Substeps<T, D>& steps, const Tensor& packed_history, bool sorts, backend::Stream stream);
@@ -72,10 +23,11 @@ class SortedCpu {
   // Whether an activation may serve several substeps of a call, with G2P and the next P2G in one pass. Exceptions:
   // - deterministic grids: the length of an activation depends on all scenes, and affects the rounding of each;
   // - gradients through a pool that does not grow, since they need room for the blocks of every substep;
-  // - FLIP, which needs the velocities of particles before the forces, and a pass does not store them.
+  // - FLIP, which needs the velocities of particles before the forces, and a pass does not store them;
+  // - heat, whose solve is between G2P and the next step.
   static bool may_last(const SubstepsInputs& in) {
     return in.lattice.order() == 2 && in.n > kLeastLastingSteps && !in.lattice.deterministic() &&
-           (in.grows || in.resident) && in.flip == 0;
+           (in.grows || in.resident) && in.flip == 0 && !HeatSteps<T, D>::wanted(in);
   }
 
   // One substep, with `following` further ones; false as for `Substeps::activate`.
@@ -125,6 +77,9 @@ class SortedCpu {
     visit(volume_, -1, false, false);
     if (s_.columns > 0) visit(history, R::rest, true, true);
     for (size_t k = 0; k < parameters_.size(); k++) visit(parameters_[k], parameter_row(k), true, false);
+    if (!heat) return;
+    visit(heat->fields, -1, false, false);
+    for (OwnField<T>& parameter : heat->parameters) visit(parameter, -1, false, false);
   }
   int parameter_row(size_t k) const { return R::rest + int(s_.columns) + int(k); }
 
@@ -169,6 +124,7 @@ SortedCpu<T, D>::SortedCpu(Substeps<T, D>& steps, const Tensor& packed_history, 
   volume_ = {like, s_.p2g.volume, {P}};
   if (s_.columns > 0) history = OwnField<T>(packed_history);
   if (s_.flips()) kept_ = OwnField<T>(s_.kept);
+  if (HeatSteps<T, D>::wanted(in_)) heat.emplace(s_);
   if (has(in_.scene)) scene_ = {like, field<const int>(*in_.scene), {P}};
   if (has(in_.material)) material_ = {like, field<const int>(*in_.material), {P}};
   s_.forget_stress();
@@ -268,6 +224,7 @@ bool SortedCpu<T, D>::begin(const int* status_before, int* status, int64_t follo
   passes_ = 0;
   if (tries_ && displacement_.lost != 0) patience_ = kActivationsOfPatience;  // no room for the blocks around
   tries_ = tries_ && displacement_.lost == 0;
+  if (heat) heat->begin(F.now(), J.now(), volume_.now(), stream_);
   give_to_nodes(tries_ || pays(following));
   return true;
 }
@@ -406,7 +363,7 @@ void SortedCpu<T, D>::set_advance() {
   a.J = J.now();
   a.residual = residual.now();
   a.gather.value = v.next(false);
-  a.x_next = x.next(false);
+  a.x_next = x.next(heat.has_value());  // heat needs the positions before the step
   if (in_.wants_C) a.gather.moment = C.next(false);
   if (has(in_.F)) a.F_next = F.next(false);
   if (has(in_.J)) a.J_next = J.next(false);
@@ -442,9 +399,11 @@ void SortedCpu<T, D>::advance() {
     set_advance();
     backend::g2p_advance(in_.lattice.order(), s_.advance, stream_);
     if (s_.flips()) s_.add_flip(kept_.now(), stream_);
+    if (heat) heat->run(x.now(), mass_.now(), constant(s_.advance.gather.moment), scene_.now(), stream_);
   }
+  moved_ |= heat.has_value();
   v.go(false);
-  x.go(false);
+  x.go(heat.has_value());
   if (in_.wants_C) C.go(false);
   if (has(in_.F)) F.go(false);
   if (has(in_.J)) J.go(false);
@@ -462,6 +421,7 @@ void SortedCpu<T, D>::restore_order() {
     if (has(in_.J)) visit(J);
     if (has(in_.residual)) visit(residual);
     if (s_.columns > 0) visit(history);
+    if (heat) visit(heat->fields);
   };
   each([&](OwnField<T>& f) { f.rows(rows_, 0, true, true); });
   const Tensor place = empty_int(in_.x, {in_.x.size(0)});

@@ -1,0 +1,76 @@
+#pragma once
+
+#include <cmath>
+
+#include "common/matrix.h"
+
+// Formulas of a step of heat for one particle (torch_mpm/heat/heat.py), for any scalar.
+namespace mpm {
+inline namespace TORCH_MPM_ISA {
+
+template <class T>
+MPM_HD T clamp_to_unit(const T& a) {
+  return select(a > T(1), T(1), select(a < T(0), T(0), a));
+}
+
+// Length with derivative zero at the zero vector, from its square.
+template <class T>
+MPM_HD T safe_root(const T& squared) {
+  const auto positive = squared > T(0);
+  return select(positive, sqrt(select(positive, squared, T(1))), T(0));
+}
+
+// Heat capacity m C, conductance κ V, diffusion number r = κ V dt/(m C dx²), and the blend β = min(1, 4 r + dt |sym
+// ∇v|) of the hybrid. Where matter is strained, the gradient of the particle relaxes to that of the grid.
+template <class T>
+struct HeatWeights {
+  T capacity, conductance, number, blend;
+};
+
+template <class T, int D>
+MPM_HD HeatWeights<T> heat_weights(const T& volume, const T& specific_heat, const T& conductivity, const T& mass,
+                                   const T& dt, const Matrix<T, D>& L, const T& dx) {
+  HeatWeights<T> w;
+  w.capacity = specific_heat * mass;
+  w.conductance = select(conductivity >= T(0), conductivity, T(NAN)) * volume;
+  T squared = T(0);
+  MPM_UNROLL for (int i = 0; i < D; i++) MPM_UNROLL
+    for (int j = 0; j < D; j++) {
+      const T strain = T(0.5) * (L[i][j] + L[j][i]);
+      squared = squared + strain * strain;
+    }
+  w.number = dt * w.conductance / (select(w.capacity > T(0), w.capacity, T(1)) * dx * dx);
+  const T rate = T(4) * w.number + dt * safe_root(squared);
+  w.blend = select(rate > T(1), T(1), rate);
+  return w;
+}
+
+// A quantity after G2P, from the gathered increment and the gathered average θ̄ of the particles.
+template <class T>
+MPM_HD T blended(const T& increment, const T& average, const T& before, const T& blend) {
+  return before + increment + blend * (average - before);
+}
+
+// The temperature gradient transported with matter that moves by 1 + dt ∇v: the inverse transpose of that times g, to
+// second order in dt.
+template <class T, int D>
+MPM_HD Vector<T, D> transported_gradient(const Vector<T, D>& g, const Matrix<T, D>& L, const T& dt) {
+  const Vector<T, D> first = dt * (transpose(L) * g), second = dt * (transpose(L) * first);
+  Vector<T, D> r;
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    r[i] = g[i] - first[i] + second[i];
+  return r;
+}
+
+// Moves the excess of θ over the melting point into the latent heat, or out of it (enthalpy buffer; Stomakhin et al.
+// 2014). Returns the diffusion number r where the liquid fraction changes, else zero.
+template <class T>
+MPM_HD T melt(T& theta, T& liquid, const T& melting_point, const T& specific_heat, const T& latent_heat, const T& r) {
+  const T ratio = specific_heat / latent_heat, before = liquid;
+  liquid = clamp_to_unit(before + ratio * (theta - melting_point));
+  theta = theta - (liquid - before) / ratio;
+  return select(liquid > before, r, select(liquid < before, r, T(0)));
+}
+
+}  // namespace TORCH_MPM_ISA
+}  // namespace mpm

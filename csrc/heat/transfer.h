@@ -1,0 +1,91 @@
+#pragma once
+
+#include "common/fields.h"
+#include "grid/topology.h"
+
+// Transfer of temperature between particles and nodes in a rollout. The particles of the call are those of its P2G and
+// G2P, with the same activation.
+namespace mpm {
+
+constexpr int kHeatChannels = 4;  // of the sums of a node: w θ, w β θ, w, w β with w = N m C
+
+enum class HeatTransfer { hybrid, apic, flip, pic };
+
+// A quantity that is uniform, per scene or per particle.
+template <class T>
+struct HeatValue {
+  const T* pointer = nullptr;
+  int64_t stride = 0;  // elements from particle to particle, or from scene to scene; zero where it is uniform
+  bool per_scene = false;
+};
+
+// Fields of the particles.
+template <class T>
+struct HeatParticles {
+  Field<const T> theta, gradient, liquid;  // [P], [P, D], [P]; the last two may be absent
+  Field<const T> volume;                   // present volume [P]
+};
+
+// Present volumes, from rest volumes and F or J.
+template <class T, int D>
+struct HeatVolumesArguments {
+  int64_t particles = 0;
+  Field<const T> rest, F, J;
+  Field<T> volume;
+};
+
+template <class T, int D>
+struct HeatToNodesArguments {
+  Topology<T, D> topology;
+  Field<const T> x, mass, velocity_gradient;
+  HeatParticles<T> particles;
+  HeatValue<T> conductivity, specific_heat;
+  HeatTransfer transfer = HeatTransfer::hybrid;
+  Field<const T> scene_dt;
+  double dt = 0;
+  Field<T> conductance, blend, number;  // results per particle
+  NodeField<T> sums;                    // kHeatChannels, zero on entry
+};
+
+// Averages of the nodes from their sums: θ, its heat capacity, and θ̄, which replaces w β θ.
+template <class T, int D>
+struct HeatMeansArguments {
+  int64_t nodes = 0;
+  T* sums = nullptr;
+  T* theta = nullptr;
+  T* capacity = nullptr;
+};
+
+// Replaces the first channel of the sums by the increments of the solve.
+template <class T, int D>
+struct HeatIncrementsArguments {
+  int64_t nodes = 0;
+  const T* increment = nullptr;
+  T* sums = nullptr;
+};
+
+template <class T, int D>
+struct HeatToParticlesArguments {
+  Topology<T, D> topology;
+  Field<const T> x, velocity_gradient, blend, number;
+  HeatParticles<T> particles;
+  HeatValue<T> specific_heat, melting_point, latent_heat;
+  HeatTransfer transfer = HeatTransfer::hybrid;
+  Field<const T> scene_dt;
+  double dt = 0, moment_scale = 1;
+  NodeField<const T> nodes;          // increment and θ̄
+  Field<T> theta, gradient, liquid;  // results, in other memory than the inputs
+  Field<T> changing;                 // diffusion number where the liquid fraction changes, else zero; may be absent
+};
+
+// The largest of a value of the particles in each scene, NaN where one is NaN.
+template <class T, int D>
+struct HeatLargestArguments {
+  int64_t particles = 0, scenes = 0;
+  Field<const T> value;
+  Field<const int> scene;     // absent: one scene
+  double* largest = nullptr;  // [scenes], raised to it
+  int64_t stride = 1;
+};
+
+}  // namespace mpm

@@ -1,0 +1,275 @@
+#pragma once
+
+#include <algorithm>
+#include <optional>
+
+#include "heat/kernels.h"
+#include "rollout/own_field.cpu.h"
+#include "rollout/step_kernels.h"
+
+// Conduction of heat in the substeps of a call on the CPU, in the order of torch_mpm/heat/heat.py: present volumes
+// before the laws; after G2P, with the positions before it: sums on the nodes, the solve, and the temperature of the
+// particles.
+namespace mpm {
+
+// Columns of the status of a scene.
+enum HeatStatus : int { kUnsolved = 0, kLargestResidual = 1, kLargestFront = 2, kHeatStatusSize = 3 };
+
+template <class T, int D>
+class HeatSteps {
+ public:
+  OwnField<T> fields;                   // [P, m]: temperature, gradient, liquid fraction, present volume
+  std::vector<OwnField<T>> parameters;  // those with a value per particle
+  Tensor status;                        // [B, kHeatStatusSize], float64
+
+  static bool wanted(const SubstepsInputs& in) { return !in.heat.empty(); }
+
+  explicit HeatSteps(Substeps<T, D>& steps);
+
+  // Computes the present volumes; before laws change F.
+  void begin(const Field<const T>& F, const Field<const T>& J, const Field<const T>& rest, backend::Stream stream) {
+    HeatVolumesArguments<T, D> a;
+    a.particles = particles();
+    a.rest = rest;
+    a.F = F;
+    a.J = J;
+    a.volume = column(fields.next(false), volume_);
+    backend::heat_volumes(a, stream);
+  }
+
+  // Computes the temperatures after a substep, with positions before it and the velocity gradient after it.
+  void run(const Field<const T>& x, const Field<const T>& mass, const Field<const T>& velocity_gradient,
+           const Field<const int>& scene, backend::Stream stream) {
+    make_nodes();
+    HeatToNodesArguments<T, D> down = to_nodes(x, mass, velocity_gradient);
+    backend::heat_to_nodes(in_.lattice.order(), down, stream);
+    solve(x, scene, stream);
+    HeatToParticlesArguments<T, D> up = to_particles(down);
+    backend::heat_to_particles(in_.lattice.order(), up, stream);
+    fields.go(true);
+    count(scene, stream);
+  }
+
+ private:
+  int64_t particles() const { return in_.x.size(0); }
+  bool melts() const { return liquid_ >= 0; }
+
+  template <class E>
+  static Field<E> column(const Field<E>& f, int first) {
+    return first < 0 ? Field<E>{} : Field<E>{f.pointer + first * f.stride[1], {f.stride[0], f.stride[1], 0}};
+  }
+  HeatParticles<T> given() const {
+    const Field<const T>& f = fields.now();
+    return {column(f, 0), column(f, gradient_), column(f, liquid_), column(f, volume_)};
+  }
+
+  void pack();
+  void read_parameter(const Tensor& t, const char* name);
+  HeatValue<T> value(size_t k) const;
+  void make_nodes();
+  HeatToNodesArguments<T, D> to_nodes(const Field<const T>& x, const Field<const T>& mass,
+                                      const Field<const T>& velocity_gradient) const;
+  HeatToParticlesArguments<T, D> to_particles(const HeatToNodesArguments<T, D>& down);
+  void solve(const Field<const T>& x, const Field<const int>& scene, backend::Stream stream);
+  void find_largest(const Field<const T>& of, const Field<const int>& scene, double* to, int64_t stride,
+                    backend::Stream stream) const;
+  void count(const Field<const int>& scene, backend::Stream stream);
+
+  Substeps<T, D>& s_;
+  const SubstepsInputs& in_;
+  int gradient_ = -1, liquid_ = -1, volume_ = 1;  // columns
+  std::vector<HeatValue<T>> values_;              // of the parameters; those per particle have no pointer
+  std::vector<int> own_;                          // index in `parameters`, or -1
+  Tensor conductance_, blend_, number_, changing_;
+  std::vector<double> bounds_;  // of the spectrum of each scene, see HeatArguments
+  int64_t slots_ = -1;
+  Tensor sums_, theta_, capacity_, increment_, iterations_, residual_, converged_, workspace_;
+};
+
+template <class T, int D>
+HeatSteps<T, D>::HeatSteps(Substeps<T, D>& steps) : s_(steps), in_(steps.in) {
+  const Tensor& x = in_.x;
+  const int64_t P = x.size(0);
+  STD_TORCH_CHECK(in_.heat.size() == 3 || in_.heat.size() == 6, "heat must be 3 or 6 tensors, got ", in_.heat.size());
+  STD_TORCH_CHECK(in_.heat_transfer >= 0 && in_.heat_transfer <= int64_t(HeatTransfer::pic),
+                  "heat_transfer must be 0 to 3, got ", in_.heat_transfer);
+  STD_TORCH_CHECK(in_.heat_iterations > 0 && in_.heat_iterations <= INT32_MAX, "heat_iterations must be positive, got ",
+                  in_.heat_iterations);
+  STD_TORCH_CHECK(in_.heat_tolerance > 0 && in_.heat_tolerance < 1, "heat_tolerance must be between 0 and 1, got ",
+                  in_.heat_tolerance);
+  STD_TORCH_CHECK(in_.wants_C, "heat needs wants_C");
+  STD_TORCH_CHECK(s_.p2g.form == StressForm::mls, "heat needs the stress form mls");
+  pack();
+  for (const size_t k : {1, 2, 4, 5})
+    if (k < in_.heat.size()) read_parameter(in_.heat[k], element("heat", int(k)).c_str());
+  conductance_ = empty(x, {P});
+  blend_ = empty(x, {P});
+  number_ = empty(x, {P});
+  if (melts()) changing_ = empty(x, {P});
+  bounds_.resize(size_t(in_.scenes));
+  status = empty(x, {in_.scenes, int64_t(kHeatStatusSize)}, ScalarType::Double);
+  torch::stable::zero_(status);
+  iterations_ = empty_int(x, {in_.scenes});
+  residual_ = empty(x, {in_.scenes});
+  converged_ = empty(x, {in_.scenes}, ScalarType::Bool);
+}
+
+template <class T, int D>
+void HeatSteps<T, D>::pack() {
+  const Tensor& x = in_.x;
+  const int64_t P = x.size(0);
+  int columns = 1;
+  if (has(in_.temperature_gradient)) gradient_ = columns, columns += D;
+  if (in_.heat.size() == 6) liquid_ = columns++;
+  volume_ = columns++;
+  Tensor packed = empty_particles(x, {P, columns});
+  torch::stable::zero_(packed);
+  const auto put = [&](const Tensor& t, const char* name, int first, int width) {
+    check_shape(t, name, width == 1 ? Shape{P} : Shape{P, width});
+    check_like(t, name, x);
+    Tensor part = torch::stable::narrow(packed, 1, first, width);
+    torch::stable::copy_(part, torch::stable::reshape(t, {P, width}));
+  };
+  put(in_.heat[0], "heat[0]", 0, 1);
+  if (gradient_ >= 0) put(*in_.temperature_gradient, "temperature_gradient", gradient_, D);
+  if (melts()) put(in_.heat[3], "heat[3]", liquid_, 1);
+  fields = OwnField<T>(packed);
+}
+
+template <class T, int D>
+void HeatSteps<T, D>::read_parameter(const Tensor& t, const char* name) {
+  const int64_t P = particles();
+  ParameterScenes scenes(in_.scene, in_.scenes);
+  const Parameter<T> p = parameter<T>(t, name, in_.x, P, scenes);
+  const bool own = p.stride != 0 && p.scenes == 0;
+  own_.push_back(own ? int(parameters.size()) : -1);
+  values_.push_back({own ? nullptr : p.pointer, p.stride, p.scenes > 0});
+  if (own) parameters.push_back({in_.x, {p.pointer, {p.stride, 0, 0}}, {P}});
+}
+
+template <class T, int D>
+HeatValue<T> HeatSteps<T, D>::value(size_t k) const {
+  if (k >= values_.size()) return {};
+  if (own_[k] < 0) return values_[k];
+  const Field<const T>& f = parameters[size_t(own_[k])].now();
+  return {f.pointer, f.stride[0], false};
+}
+
+// Makes the node tensors for the size of the pool.
+template <class T, int D>
+void HeatSteps<T, D>::make_nodes() {
+  const int64_t slots = s_.activation.slots(), nodes = slots * kBlockNodes<D>;
+  if (slots != slots_) {
+    slots_ = slots;
+    sums_ = empty(in_.x, {nodes, kHeatChannels});
+    theta_ = empty(in_.x, {nodes});
+    capacity_ = empty(in_.x, {nodes});
+    increment_ = empty(in_.x, {nodes});
+    workspace_ = Tensor();
+  }
+  clear(sums_);
+}
+
+template <class T, int D>
+HeatToNodesArguments<T, D> HeatSteps<T, D>::to_nodes(const Field<const T>& x, const Field<const T>& mass,
+                                                     const Field<const T>& velocity_gradient) const {
+  HeatToNodesArguments<T, D> a;
+  a.topology = s_.p2g.topology;
+  a.x = x;
+  a.mass = mass;
+  a.velocity_gradient = velocity_gradient;
+  a.particles = given();
+  a.conductivity = value(0);
+  a.specific_heat = value(1);
+  a.transfer = HeatTransfer(in_.heat_transfer);
+  a.scene_dt = s_.p2g.scene_dt;
+  a.dt = in_.dt;
+  a.conductance = field<T>(conductance_);
+  a.blend = field<T>(blend_);
+  a.number = field<T>(number_);
+  a.sums = {static_cast<T*>(sums_.data_ptr()), kHeatChannels, kHeatChannels};
+  return a;
+}
+
+template <class T, int D>
+HeatToParticlesArguments<T, D> HeatSteps<T, D>::to_particles(const HeatToNodesArguments<T, D>& down) {
+  HeatToParticlesArguments<T, D> a;
+  a.topology = down.topology;
+  a.x = down.x;
+  a.velocity_gradient = down.velocity_gradient;
+  a.blend = constant(down.blend);
+  a.number = constant(down.number);
+  a.particles = down.particles;
+  a.specific_heat = down.specific_heat;
+  a.melting_point = value(2);
+  a.latent_heat = value(3);
+  a.scene_dt = down.scene_dt;
+  a.dt = down.dt;
+  a.moment_scale = in_.lattice.inverse_inertia();
+  a.nodes = {down.sums.pointer, kHeatChannels, 2};
+  const Field<T> next = fields.next(true);
+  a.theta = column(next, 0);
+  a.gradient = column(next, gradient_);
+  a.liquid = column(next, liquid_);
+  a.changing = field<T>(changing_);
+  return a;
+}
+
+template <class T, int D>
+void HeatSteps<T, D>::find_largest(const Field<const T>& of, const Field<const int>& scene, double* to, int64_t stride,
+                                   backend::Stream stream) const {
+  if (in_.scenes > 0)
+    backend::heat_largest(HeatLargestArguments<T, D>{particles(), in_.scenes, of, scene, to, stride}, stream);
+}
+
+template <class T, int D>
+void HeatSteps<T, D>::solve(const Field<const T>& x, const Field<const int>& scene, backend::Stream stream) {
+  const int64_t nodes = slots_ * kBlockNodes<D>;
+  T* const sums = static_cast<T*>(sums_.data_ptr());
+  T* const theta = static_cast<T*>(theta_.data_ptr());
+  T* const capacity = static_cast<T*>(capacity_.data_ptr());
+  backend::heat_means(HeatMeansArguments<T, D>{nodes, sums, theta, capacity}, stream);
+  HeatArguments<T, D> a;
+  a.topology = s_.p2g.topology;
+  a.x = x;
+  a.conductance = field<const T>(conductance_);
+  a.heat_capacity = capacity;
+  a.theta = theta;
+  a.dt = in_.dt;
+  a.scene_dt = s_.p2g.scene_dt.pointer;
+  a.tolerance = kNegligibleResidual;
+  a.relative_tolerance = in_.heat_tolerance;
+  a.most = int(in_.heat_iterations);
+  // With W = M/dt, u · H u ≤ Σ K_i u_i² and K_i = D⁻¹ Σ_p κ_p V_p N_i ≤ D⁻¹ dx² max_p r_p W_i (csrc/heat/cell.h).
+  std::fill(bounds_.begin(), bounds_.end(), 0.0);
+  find_largest(field<const T>(number_), scene, bounds_.data(), 1, stream);
+  for (double& bound : bounds_) bound *= in_.lattice.inverse_inertia() * in_.lattice.dx() * in_.lattice.dx();
+  a.scene_bound = bounds_.data();
+  a.deterministic = in_.lattice.deterministic();
+  a.increment = static_cast<T*>(increment_.data_ptr());
+  a.iterations = static_cast<int*>(iterations_.data_ptr());
+  a.residual = static_cast<T*>(residual_.data_ptr());
+  a.converged = static_cast<bool*>(converged_.data_ptr());
+  if (!workspace_.defined()) workspace_ = empty(in_.x, {backend::heat_workspace(a, stream)}, ScalarType::Byte);
+  a.workspace = workspace_.data_ptr();
+  backend::heat_cg(in_.lattice.order(), a, stream);
+  backend::heat_increments(HeatIncrementsArguments<T, D>{nodes, a.increment, sums}, stream);
+}
+
+// Adds the solves and fronts of a substep to the status.
+template <class T, int D>
+void HeatSteps<T, D>::count(const Field<const int>& scene, backend::Stream stream) {
+  double* const rows = static_cast<double*>(status.data_ptr());
+  const T* const residual = static_cast<const T*>(residual_.data_ptr());
+  const bool* const converged = static_cast<const bool*>(converged_.data_ptr());
+  const T* const scene_dt = s_.p2g.scene_dt.pointer;
+  for (int64_t b = 0; b < in_.scenes; b++) {
+    if (converged[b] || (scene_dt && scene_dt[b] == T(0))) continue;  // a paused scene has nothing to solve
+    double* const row = rows + b * kHeatStatusSize;
+    row[kUnsolved] += 1;
+    if (!(double(residual[b]) <= row[kLargestResidual])) row[kLargestResidual] = double(residual[b]);  // NaN stays
+  }
+  if (melts()) find_largest(field<const T>(changing_), scene, rows + kLargestFront, kHeatStatusSize, stream);
+}
+
+}  // namespace mpm

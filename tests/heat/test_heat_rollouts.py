@@ -1,0 +1,249 @@
+"""Heat in rollouts of the fused op, against single steps composed of ops."""
+
+import random
+import warnings
+
+import pytest
+import torch
+from helpers import relative_error
+
+import torch_mpm as mpm
+from benchmarks.catalogue.laws import named
+from torch_mpm import heat_boundaries
+from torch_mpm.rollouts import plan_rollout
+
+DT = 2e-4
+LAWS = ("neo_hookean", "fluid", "von_mises", "sand", "viscoelastic")
+TRANSFERS = ("hybrid", "apic", "flip", "pic")
+
+
+def scene(dim=3, dtype=torch.float64, scenes=1, law="neo_hookean", **options):
+    """A step and a state: a block in motion whose temperature varies, in an order that is not that of cells."""
+    g = torch.Generator().manual_seed(5)
+    melts, per_particle = options.pop("melts", False), options.pop("per_particle", False)
+    grid = mpm.Grid(0.1, (0.0,) * dim, (1.0,) * dim, scenes, options.pop("kernel", "quadratic"))
+    points = mpm.seed.box((0.25,) * dim, (0.65,) * dim, grid, 2**dim, dtype=dtype)
+    x = points.x[torch.randperm(len(points.x), generator=g)].repeat(scenes, 1)
+    count = len(x)
+    ids = torch.arange(scenes, dtype=torch.int32).repeat_interleave(count // scenes) if scenes > 1 else None
+    given = mpm.seed.Points(x, points.volume[:1].expand(count).clone(), ids)
+    velocity = 2 * torch.rand(count, dim, generator=g, dtype=torch.float64) - 1
+    state = mpm.State.at_rest(given, 1000.0, dtype=dtype).replace(
+        v=velocity.to(dtype), temperature=(10 * x[:, 0].sin() + x[:, -1]).to(dtype)
+    )
+
+    def value(number):
+        if per_particle:
+            return number * (1 + torch.rand(count, generator=g, dtype=torch.float64).to(dtype))
+        return number * torch.linspace(1, 2, scenes, dtype=dtype) if scenes > 1 else number
+
+    melting = {"melting_point": value(3.0), "latent_heat": value(500.0)} if melts else {}
+    heat = mpm.Heat(
+        grid, value(2000.0), value(100.0), transfer=options.pop("transfer", "hybrid"), tolerance=1e-9, **melting
+    )
+    laws = list(named(*LAWS).values()) if law == "mixture" else [named(law)[law]]
+    if law == "mixture":
+        state = state.replace(material=(torch.arange(count) % len(laws)).int())
+    step = mpm.Step(
+        grid, mpm.Mixture([each() for each in laws]) if law == "mixture" else laws[0](), (0.0, -10.0, 0.0)[:dim],
+        "separate", boundaries=[mpm.Sphere((0.5, 0.2, 0.5)[:dim], 0.1, friction=0.2)], heat=heat, **options,
+    )  # fmt: skip
+    return step, step.prepare(state)
+
+
+def composed(step, state, n, dt):
+    for _ in range(n):
+        state = step(state, dt)
+    return state
+
+
+def compare(step, state, n=12, dt=DT, schedule=None, tolerance=1e-9):
+    """Fields after n steps of the op are those of single steps; returns the former."""
+    with torch.no_grad():
+        assert plan_rollout(step, state, n, dt, schedule=schedule).executor == "fused"
+        got, expected = mpm.rollout(step, state, n, dt, schedule=schedule), composed(step, state, n, dt)
+    fields = {name: getattr(expected, name) for name in ("x", "v", "C", "F", "J", "temperature")} | expected.extra
+    found = {name: getattr(got, name) for name in ("x", "v", "C", "F", "J", "temperature")} | got.extra
+    assert found.keys() == fields.keys()
+    for name, value in fields.items():
+        if value is None:
+            assert found[name] is None, name
+            continue
+        scale = float(value.abs().max()) + 1e-30
+        torch.testing.assert_close(
+            found[name], value, rtol=0, atol=tolerance * scale, msg=lambda m, n=name: f"{n}: {m}"
+        )
+    assert torch.equal(torch.as_tensor(got.time), torch.as_tensor(expected.time))
+    return got
+
+
+@pytest.mark.parametrize("melts", [False, True])
+@pytest.mark.parametrize("transfer", TRANSFERS)
+def test_transfers(dim, transfer, melts):
+    compare(*scene(dim, transfer=transfer, melts=melts))
+
+
+@pytest.mark.parametrize("law", [*LAWS, "mixture"])
+def test_laws(dim, law):
+    compare(*scene(dim, law=law))
+
+
+@pytest.mark.parametrize("seed", range(24))
+def test_random_combinations(seed):
+    """Laws x transfers x kernels x batches x parameters x time steps x schedules, in both dtypes."""
+    r = random.Random(seed)
+    scenes, dtype = r.choice((1, 3)), r.choice((torch.float32, torch.float64))
+    flip = r.choice((0.0, 0.4))
+    step, state = scene(
+        r.choice((2, 3)), dtype, scenes, r.choice((*LAWS, "mixture")), melts=r.random() < 0.5,
+        per_particle=r.random() < 0.5, kernel=r.choice(("quadratic", "cubic")), transfer=r.choice(TRANSFERS),
+        flip=flip, compensated=r.choice((True, False)),
+    )  # fmt: skip
+    dt = torch.linspace(1, 2, scenes, dtype=dtype) * DT if r.random() < 0.5 else DT
+    schedule = r.choice((None, "per_step", "sorted_cpu"))
+    compare(step, state, r.choice((2, 9, 25)), dt, schedule, 1e-8 if dtype == torch.float64 else 2e-3)
+
+
+def test_long_rollouts_keep_the_order_and_the_heat():
+    step, state = scene(3, melts=True)
+    end = compare(step, state, 60)
+    before, after = (step.heat.heat_content(s).sum() for s in (state, end))
+    assert abs(float(after / before) - 1) < 1e-12
+
+
+def test_stiff_conduction_agrees():
+    """Diffusion numbers far above one take many iterations."""
+    step, state = scene(2)
+    step.heat.conductivity = 2e7
+    compare(step, state, 5, tolerance=1e-6)
+
+
+@pytest.mark.parametrize("bounds", [[4e-7], [8e-4], [2e-2], [4e-7, 8e-4, 2e-2], [8e-4, 2e-2, 4e-7]])
+def test_short_solves_reach_the_tolerance(dim, bounds):
+    """Changes of temperature at bounds of the spectrum that need one, two or more steps of the solver, against solves
+    with a tolerance near rounding; scenes of a batch need different numbers."""
+    changes = []
+    for run, tolerance in ((mpm.rollout, 1e-6), (composed, 1e-13)):
+        step, state = scene(dim, scenes=len(bounds), transfer="flip")  # hybrid and APIC change more than conduction
+        conductivity = torch.tensor(bounds, dtype=torch.float64) * 1000 * 100 * 0.1**2 / (4 * DT)
+        step.heat.specific_heat, step.heat.tolerance = torch.tensor(100.0, dtype=torch.float64), tolerance
+        step.heat.conductivity = conductivity if len(bounds) > 1 else float(conductivity)
+        with torch.no_grad():
+            changes.append(run(step, state, 4, DT).temperature - state.temperature)
+    for b, bound in enumerate(bounds):
+        rows = slice(None) if state.scene is None else state.scene == b
+        assert 1e-3 * bound < float(changes[1][rows].abs().max()) < 100 * bound
+        assert relative_error(changes[0][rows], changes[1][rows]) < 2e-6
+
+
+def test_paused_scenes():
+    step, state = scene(2, scenes=3)
+    dt = torch.tensor([DT, 0.0, 2 * DT], dtype=torch.float64)
+    end = compare(step, state, 6, dt)
+    rows = state.scene == 1
+    assert torch.equal(end.temperature[rows], state.temperature[rows])
+    step.check(end)
+
+
+def test_rollout_to_and_frames():
+    step, state = scene(2)
+    with torch.no_grad():
+        result = mpm.rollout_to(step, state, 5e-3)
+        assert float(result.state.time) == pytest.approx(5e-3)
+        frames = mpm.frames(step, state, 12, DT, 4, ("temperature",))
+        later = [mpm.rollout(step, state, n, DT).temperature for n in (0, 4, 8, 12)]
+    torch.testing.assert_close(frames.fields["temperature"], torch.stack(later))
+    torch.testing.assert_close(frames.end.temperature, later[-1])
+
+
+def test_unsolved_heat_is_reported():
+    messages = []
+    for run in (mpm.rollout, composed):
+        step, state = scene(2)
+        step.heat.max_iterations, step.heat.conductivity = 1, 2e6
+        with torch.no_grad():
+            run(step, state, 3, DT)
+        with pytest.raises(mpm.SimulationError) as error:
+            step.check()
+        messages.append(str(error.value))
+    assert messages[0] == messages[1] and "heat" in messages[0]
+
+
+def test_lagging_fronts_are_reported():
+    numbers = []
+    for run in (mpm.rollout, composed):
+        step, state = scene(2, melts=True, scenes=2)
+        step.heat.conductivity = torch.tensor(2e7, dtype=torch.float64)
+        with torch.no_grad(), warnings.catch_warnings():
+            warnings.simplefilter("error")
+            run(step, state, 3, DT)
+            numbers.append(step.heat.fronts.largest)
+            with pytest.raises(mpm.FrontWarning):
+                step.check()
+    torch.testing.assert_close(*numbers)
+
+
+def _of_function(step):
+    step.heat.conductivity = lambda theta: 1 + theta * 0
+
+
+REFUSED = {
+    "its heat has boundaries": lambda s: setattr(s.heat, "boundaries", [heat_boundaries.Source(1.0)]),
+    "its heat is solved by multigrid": lambda s: setattr(s.heat, "method", "multigrid"),
+    "the law dissipates energy into heat": lambda s: setattr(s.heat, "plastic_heating", 0.5),
+    "another stress form than mls": lambda s: setattr(s, "stress_form", "gradient"),
+    "a parameter of its heat is a function": _of_function,
+    "its heat has another grid": lambda s: setattr(s.heat, "grid", mpm.Grid(0.1, (0.0, 0.0), (1.0, 1.0))),
+}
+
+
+@pytest.mark.parametrize("reason", REFUSED)
+def test_other_heat_goes_step_by_step(reason):
+    step, state = scene(2)
+    REFUSED[reason](step)
+    with torch.no_grad():
+        plan = plan_rollout(step, state, 10, DT)
+        assert plan.executor == "loop" and reason in plan.reasons["fused"]
+        got = mpm.rollout(step, state, 2, DT)
+        assert torch.equal(got.temperature, composed(step, state, 2, DT).temperature)
+
+
+@pytest.mark.parametrize("of", ["temperature", "v", "conductivity"])
+def test_gradients_go_step_by_step(of):
+    step, state = scene(2)
+    if of == "conductivity":
+        leaf = step.heat.conductivity = torch.tensor(2000.0, dtype=torch.float64, requires_grad=True)
+    else:
+        leaf = getattr(state, of).clone().requires_grad_()
+        state = state.replace(**{of: leaf})
+    plan = plan_rollout(step, state, 3, DT)
+    assert plan.executor == "loop" and "a gradient is wanted" in plan.reasons["fused"]
+    ends = [run(step, state, 3, DT) for run in (mpm.rollout, composed)]
+    grads = [torch.autograd.grad(end.temperature.square().sum(), leaf)[0] for end in ends]
+    assert float(grads[0].abs().max()) > 0
+    torch.testing.assert_close(*grads)
+
+
+def test_raw_op():
+    step, state = scene(2, melts=True)
+    arguments = mpm.substeps_arguments(step, state, 4, DT)
+    with torch.no_grad():
+        heat = torch.ops.torch_mpm.substeps(**arguments)[-3]
+        assert torch.equal(heat[:, 0], mpm.rollout(step, state, 4, DT).temperature)
+    torch.library.opcheck(torch.ops.torch_mpm.substeps, tuple(arguments.values()), test_utils="test_faketensor")
+    wrong = {
+        "heat must be 3 or 6 tensors": {"heat": arguments["heat"][:2]},
+        "heat.1. must be a scalar or have shape": {
+            "heat": [arguments["heat"][0], torch.ones(7).double(), *arguments["heat"][2:]]
+        },
+        "heat.0. must have shape": {"heat": [arguments["heat"][0][1:], *arguments["heat"][1:]]},
+        "temperature_gradient must have shape": {"temperature_gradient": state.x[1:]},
+        "heat_transfer must be 0 to 3, got 4": {"heat_transfer": 4},
+        "heat_tolerance must be between 0 and 1": {"heat_tolerance": 1.0},
+        "heat_iterations must be positive": {"heat_iterations": 0},
+        "heat needs wants_C": {"wants_C": False, "apic": False},
+        "without gradients": {"resident": False},
+    }
+    for message, change in wrong.items():
+        with pytest.raises(RuntimeError, match=message):
+            torch.ops.torch_mpm.substeps(**arguments | change)
