@@ -10,6 +10,7 @@ from helpers import relative_error
 import torch_mpm as mpm
 from benchmarks.catalogue.laws import named
 from torch_mpm import heat_boundaries
+from torch_mpm.laws.parameters import PerMaterial
 from torch_mpm.rollouts import plan_rollout
 
 DT = 2e-4
@@ -86,6 +87,23 @@ def test_transfers(dim, transfer, melts):
 @pytest.mark.parametrize("law", [*LAWS, "mixture"])
 def test_laws(dim, law):
     compare(*scene(dim, law=law))
+
+
+def test_parameters_of_materials(dim):
+    """Numbers for each material, as in scene files; one of the materials does not melt."""
+    step, state = scene(dim, law="mixture", melts=True)
+    numbers = {"conductivity": 500.0, "specific_heat": 80.0, "melting_point": 1.0, "latent_heat": 300.0}
+    for name, number in numbers.items():
+        values = [number * (1 + k) for k in range(len(LAWS))]
+        if name == "melting_point":
+            values[1] = float("inf")
+        setattr(step.heat, name, PerMaterial(values))
+    extra = {name: value for name, value in state.extra.items() if name != "liquid"}
+    end = compare(step, step.prepare(state.replace(extra=extra)))
+    solid = state.material == 1
+    assert not end.extra["liquid"][solid].any() and end.extra["liquid"][~solid].any()
+    step.heat.conductivity = PerMaterial([1.0] * (len(LAWS) - 1) + [lambda theta: theta])
+    assert "is a function" in plan_rollout(step, state, 5, DT).reasons["fused"]
 
 
 @pytest.mark.parametrize("seed", range(24))

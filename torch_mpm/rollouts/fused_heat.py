@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..heat.heat import GRADIENT, TRANSFERS, Heat
-from ..laws.parameters import check_length, needed_temperature
+from ..laws.parameters import PerMaterial, check_length, evaluate, needed_temperature
 from ..laws.thermal import LIQUID
 from ..state.state import State
 from ..step.step import Step
@@ -34,13 +34,22 @@ def why_not_fused_heat(step: Step, state: State, dt: float | Tensor) -> str | No
     if step.stress_form != "mls":
         return "it conducts heat with another stress form than mls"
     values = _values(heat)
-    if any(callable(value) and not isinstance(value, Tensor) for value in values):
+    if any(_is_function(value) for value in values):
         return "a parameter of its heat is a function"
     if torch.is_grad_enabled():
-        tensors = [v for v in (*values, *_fields(heat, state)) if isinstance(v, Tensor)]
-        if any(t.requires_grad for t in tensors) or differentiates(step, state, dt):
+        parts = [part for v in values for part in (v.values() if isinstance(v, PerMaterial) else (v,))]
+        if any(t.requires_grad for t in (*parts, *_fields(heat, state)) if isinstance(t, Tensor)) or differentiates(
+            step, state, dt
+        ):
             return "it conducts heat, and a gradient is wanted"
     return None
+
+
+def _is_function(value: Any) -> bool:
+    """Whether a parameter depends on the temperature, or may do so."""
+    if isinstance(value, PerMaterial):
+        return any(_is_function(part) for part in value.values())
+    return callable(value) and not isinstance(value, Tensor)
 
 
 def _values(heat: Heat) -> tuple[Any, ...]:
@@ -62,7 +71,8 @@ def heat_arguments(heat: Heat | None, state: State) -> tuple[Any, ...]:
     values = []
     for name, value in zip(names, _values(heat), strict=False):
         check_length(name, value, len(state), scenes)
-        values.append(torch.as_tensor(value, dtype=temperature.dtype, device=temperature.device))
+        number = evaluate(name, value, state) if isinstance(value, PerMaterial) else value
+        values.append(torch.as_tensor(number, dtype=temperature.dtype, device=temperature.device))
     melting = [state.extra[LIQUID], *values[2:]] if heat.melts else []
     gradient = state.extra[GRADIENT] if heat.affine else None
     return (
