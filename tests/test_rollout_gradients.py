@@ -394,7 +394,28 @@ def raw_arguments(device: str) -> list:
     walls = wall_arguments(mpm.Walls("slip"), grid)
     obstacles = obstacle_arguments(ball, state.x, 2)
     impulse = torch.randn(2, 5, 3, generator=g, dtype=F64).to(device)
-    rest = (*walls, *obstacles, 0.0, 2, 64, False, False, False, impulse, None, None, [], None, 0, 0.5, 1, *grid.packed)
+    rest = (
+        *walls,
+        *obstacles,
+        0.0,
+        2,
+        64,
+        False,
+        False,
+        False,
+        impulse,
+        None,
+        None,
+        [],
+        None,
+        0,
+        0.5,
+        1,
+        [],
+        0,
+        None,
+        *grid.packed,
+    )
     return [*particles, [state.mass * 0], scene, None, material, None, *laws, *how, *rest]
 
 

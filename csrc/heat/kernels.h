@@ -20,6 +20,9 @@ MPM_BACKEND_KERNELS(MPM_HEAT_KERNELS)
   ORDERED(heat_to_nodes, HeatToNodesArguments)          \
   PLAIN(heat_means, HeatMeansArguments)                 \
   PLAIN(heat_largest, HeatLargestArguments)             \
+  PLAIN(heat_hold, HeatHoldArguments)                   \
+  PLAIN(heat_layers, HeatLayersArguments)               \
+  PLAIN(heat_from_surface, HeatFromSurfaceArguments)    \
   PLAIN(heat_increments, HeatIncrementsArguments)       \
   ORDERED(heat_to_particles, HeatToParticlesArguments)
 MPM_BACKEND_KERNELS(MPM_HEAT_TRANSFER_KERNELS)

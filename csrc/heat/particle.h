@@ -2,7 +2,7 @@
 
 #include <cmath>
 
-#include "common/matrix.h"
+#include "common/safe_root.h"
 
 // Formulas of a step of heat for one particle (torch_mpm/heat/heat.py), for any scalar.
 namespace mpm {
@@ -11,13 +11,6 @@ inline namespace TORCH_MPM_ISA {
 template <class T>
 MPM_HD T clamp_to_unit(const T& a) {
   return select(a > T(1), T(1), select(a < T(0), T(0), a));
-}
-
-// Length with derivative zero at the zero vector, from its square.
-template <class T>
-MPM_HD T safe_root(const T& squared) {
-  const auto positive = squared > T(0);
-  return select(positive, sqrt(select(positive, squared, T(1))), T(0));
 }
 
 // Heat capacity m C, conductance κ V, diffusion number r = κ V dt/(m C dx²), and the blend β = min(1, 4 r + dt |sym
@@ -60,6 +53,19 @@ MPM_HD Vector<T, D> transported_gradient(const Vector<T, D>& g, const Matrix<T, 
   MPM_UNROLL for (int i = 0; i < D; i++)
     r[i] = g[i] - first[i] + second[i];
   return r;
+}
+
+// Layer of width w around a held surface, at a distance a from it: the share s = 1 − (1 − a²/w²)³ of the conductivity,
+// and the rate s'/a of the exchange (torch_mpm/heat/boundaries.py, FixedSurface).
+template <class T>
+struct HeatLayerAt {
+  T share, rate;
+};
+
+template <class T>
+MPM_HD HeatLayerAt<T> heat_layer(const T& distance, const T& width) {
+  const T ratio = clamp_to_unit(distance / width), rest = T(1) - ratio * ratio;
+  return {T(1) - rest * rest * rest, T(6) / (width * width) * rest * rest};
 }
 
 // Moves the excess of θ over the melting point into the latent heat, or out of it (enthalpy buffer; Stomakhin et al.

@@ -120,7 +120,7 @@ template <class T, int D>
 void heat_increments(const HeatIncrementsArguments<T, D>& a) {
   constexpr int64_t grain = 16384;  // nodes below which a range is not split
   parallel_ranges(a.nodes, grain, [&](int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; i++) a.sums[i * kHeatChannels] = a.increment[i];
+    for (int64_t i = begin; i < end; i++) a.sums[i * kHeatChannels] = a.increment[i] + (a.start[i] - a.theta[i]);
   });
 }
 

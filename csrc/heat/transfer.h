@@ -1,6 +1,7 @@
 #pragma once
 
 #include "common/fields.h"
+#include "grid/obstacle.h"
 #include "grid/topology.h"
 
 // Transfer of temperature between particles and nodes in a rollout. The particles of the call are those of its P2G and
@@ -56,11 +57,14 @@ struct HeatMeansArguments {
   T* capacity = nullptr;
 };
 
-// Replaces the first channel of the sums by the increments of the solve.
+// Replaces the first channel of the sums by the change of the temperatures: the increments of the solve, from `start`
+// on, which differs from the average `theta` where nodes are held.
 template <class T, int D>
 struct HeatIncrementsArguments {
   int64_t nodes = 0;
   const T* increment = nullptr;
+  const T* start = nullptr;
+  const T* theta = nullptr;
   T* sums = nullptr;
 };
 
@@ -76,6 +80,42 @@ struct HeatToParticlesArguments {
   NodeField<const T> nodes;          // increment and θ̄
   Field<T> theta, gradient, liquid;  // results, in other memory than the inputs
   Field<T> changing;                 // diffusion number where the liquid fraction changes, else zero; may be absent
+};
+
+// Nodes with matter in an obstacle are held at a temperature.
+template <class T, int D>
+struct HeatHoldArguments {
+  ContactArguments<T, D> contact;
+  Topology<T, D> topology;
+  int obstacle = 0;
+  const T* temperature = nullptr;  // of scene b at temperature + b * stride
+  int64_t stride = 0;
+  const T* capacity = nullptr;  // of the nodes
+  T* theta = nullptr;           // set to the temperature
+  bool* fixed = nullptr;        // set; nodes that are already held are unchanged
+};
+
+// Particles near an obstacle whose surface is held: the remaining part of their conductance, and their exchange.
+template <class T, int D>
+struct HeatLayersArguments {
+  ContactArguments<T, D> contact;
+  int64_t particles = 0;
+  int64_t scenes = 1;
+  Field<const T> x;
+  Field<const int> scene;  // absent: one scene
+  int obstacle = 0;
+  double width = 0, inverse_inertia = 1;  // w [m], and D⁻¹ [1/m²]
+  Field<T> conductance, exchange;         // κ V, replaced by the rest; and the exchange
+};
+
+// Heat from the surface at a temperature: source += exchange · temperature, for nodes of every scene.
+template <class T, int D>
+struct HeatFromSurfaceArguments {
+  Topology<T, D> topology;
+  const T* temperature = nullptr;
+  int64_t stride = 0;
+  const T* exchange = nullptr;
+  T* source = nullptr;
 };
 
 // The largest of a value of the particles in each scene, NaN where one is NaN.

@@ -1,5 +1,6 @@
 #pragma once
 
+#include "grid/box_distance.h"
 #include "heat/particle.h"
 #include "pointwise/function.h"
 
@@ -147,9 +148,9 @@ struct HeatLayer {
   template <class T, int D>
   MPM_HD static void evaluate(Reader<T, D>& in, Writer<T, D>& out) {
     const T distance = in.scalar(), width = in.scalar();
-    const T ratio = clamp_to_unit(distance / width), rest = T(1) - ratio * ratio;
-    out.put(T(1) - rest * rest * rest);
-    out.put(T(6) / (width * width) * rest * rest);
+    const HeatLayerAt<T> layer = heat_layer(distance, width);
+    out.put(layer.share);
+    out.put(layer.rate);
   }
 };
 
@@ -224,15 +225,7 @@ struct BoxDistance {
   template <class T, int D>
   MPM_HD static void evaluate(Reader<T, D>& in, Writer<T, D>& out) {
     const Vector<T, D> x = in.vector(), size = in.vector();
-    T squared = T(0), most = T(0), sum = T(0);
-    MPM_UNROLL for (int i = 0; i < D; i++) {
-      const T depth = abs(x[i]) - T(0.5) * size[i];  // behind the faces of the axis, negative inside
-      const T outside = select(depth > T(0), depth, T(0));
-      squared = squared + outside * outside;
-      most = i == 0 ? depth : select(depth > most, depth, most);
-      sum = sum + depth;
-    }
-    out.put(select(sum == sum, safe_root(squared) + select(most < T(0), most, T(0)), sum));
+    out.put(box_distance(x, size));
   }
 };
 

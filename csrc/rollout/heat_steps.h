@@ -43,6 +43,7 @@ class HeatSteps {
     make_nodes();
     HeatToNodesArguments<T, D> down = to_nodes(x, mass, velocity_gradient);
     backend::heat_to_nodes(in_.lattice.order(), down, stream);
+    if (holds_surface()) add_layers(x, scene, stream);
     solve(x, scene, stream);
     HeatToParticlesArguments<T, D> up = to_particles(down);
     backend::heat_to_particles(in_.lattice.order(), up, stream);
@@ -53,6 +54,10 @@ class HeatSteps {
  private:
   int64_t particles() const { return in_.x.size(0); }
   bool melts() const { return liquid_ >= 0; }
+  int64_t held_nodes() const { return int64_t(in_.held_obstacles.size()) - holds_surface(); }
+  // The last of the held obstacles is held at its surface, the others at the nodes in them.
+  bool holds_surface() const { return in_.held_surface != 0; }
+  const T* held_temperature(int64_t k) const { return temperatures_.pointer + k * temperatures_.stride[0]; }
 
   template <class E>
   static Field<E> column(const Field<E>& f, int first) {
@@ -64,6 +69,9 @@ class HeatSteps {
   }
 
   void pack();
+  void check_held();
+  void add_layers(const Field<const T>& x, const Field<const int>& scene, backend::Stream stream);
+  void hold_nodes(HeatArguments<T, D>& a, backend::Stream stream);
   void read_parameter(const Tensor& t, const char* name);
   HeatValue<T> value(size_t k) const;
   void make_nodes();
@@ -81,7 +89,10 @@ class HeatSteps {
   std::vector<HeatValue<T>> values_;              // of the parameters; those per particle have no pointer
   std::vector<int> own_;                          // index in `parameters`, or -1
   Tensor conductance_, blend_, number_, changing_;
-  std::vector<double> bounds_;  // of the spectrum of each scene, see HeatArguments
+  std::vector<double> bounds_;   // of the spectrum of each scene, see HeatArguments
+  Field<const T> temperatures_;  // of the held obstacles [K, B]
+  Tensor given_;                 // exchange of the particles
+  Tensor start_, fixed_, source_, exchange_;
   int64_t slots_ = -1;
   Tensor sums_, theta_, capacity_, increment_, iterations_, residual_, converged_, workspace_;
 };
@@ -100,6 +111,7 @@ HeatSteps<T, D>::HeatSteps(Substeps<T, D>& steps) : s_(steps), in_(steps.in) {
   STD_TORCH_CHECK(in_.wants_C, "heat needs wants_C");
   STD_TORCH_CHECK(s_.p2g.form == StressForm::mls, "heat needs the stress form mls");
   pack();
+  check_held();
   for (const size_t k : {1, 2, 4, 5})
     if (k < in_.heat.size()) read_parameter(in_.heat[k], element("heat", int(k)).c_str());
   conductance_ = empty(x, {P});
@@ -137,6 +149,69 @@ void HeatSteps<T, D>::pack() {
 }
 
 template <class T, int D>
+void HeatSteps<T, D>::check_held() {
+  const int64_t count = int64_t(in_.held_obstacles.size());
+  STD_TORCH_CHECK(has(in_.held_temperatures) == (count > 0), "held_obstacles needs held_temperatures");
+  STD_TORCH_CHECK(count > 0 || !holds_surface(), "held_surface needs held_obstacles");
+  if (count == 0) return;
+  for (const int64_t k : in_.held_obstacles)
+    STD_TORCH_CHECK(k >= 0 && k < s_.contact.obstacles, "held_obstacles must be 0 to ", s_.contact.obstacles - 1,
+                    ", got ", k);
+  check_shape(*in_.held_temperatures, "held_temperatures", {count, in_.scenes});
+  check_like(*in_.held_temperatures, "held_temperatures", in_.x);
+  temperatures_ = field<const T>(*in_.held_temperatures);
+  if (holds_surface()) given_ = empty(in_.x, {particles(), 1});
+}
+
+// The layer of particles near the held surface: the rest of their conductance, and their exchange at the nodes.
+template <class T, int D>
+void HeatSteps<T, D>::add_layers(const Field<const T>& x, const Field<const int>& scene, backend::Stream stream) {
+  constexpr double kWidth = 2;  // in dx, `WIDTH` of FixedSurface
+  const int64_t k = int64_t(in_.held_obstacles.size()) - 1;
+  HeatLayersArguments<T, D> a;
+  a.contact = s_.contact;
+  a.particles = particles();
+  a.scenes = in_.scenes;
+  a.x = x;
+  a.scene = scene;
+  a.obstacle = int(in_.held_obstacles.back());
+  a.width = kWidth * in_.lattice.dx();
+  a.inverse_inertia = in_.lattice.inverse_inertia();
+  a.conductance = field<T>(conductance_);
+  a.exchange = column(field<T>(given_), 0);
+  backend::heat_layers(a, stream);
+  clear(exchange_);
+  clear(source_);
+  T* const exchange = static_cast<T*>(exchange_.data_ptr());
+  ScatterArguments<T, D> down;
+  down.topology = s_.p2g.topology;
+  down.x = x;
+  down.value = field<const T>(given_);
+  down.nodes = {exchange, 1, 1};
+  backend::scatter(in_.lattice.order(), down, stream);
+  backend::heat_from_surface(
+      HeatFromSurfaceArguments<T, D>{s_.p2g.topology, held_temperature(k), temperatures_.stride[1], exchange,
+                                     static_cast<T*>(source_.data_ptr())},
+      stream);
+}
+
+// Sets the temperatures at the start of the solve, and which nodes stay at them.
+template <class T, int D>
+void HeatSteps<T, D>::hold_nodes(HeatArguments<T, D>& a, backend::Stream stream) {
+  torch::stable::copy_(start_, theta_);
+  clear(fixed_);
+  T* const start = static_cast<T*>(start_.data_ptr());
+  bool* const fixed = static_cast<bool*>(fixed_.data_ptr());
+  for (int64_t k = 0; k < held_nodes(); k++)
+    backend::heat_hold(
+        HeatHoldArguments<T, D>{s_.contact, s_.p2g.topology, int(in_.held_obstacles[size_t(k)]), held_temperature(k),
+                                temperatures_.stride[1], a.heat_capacity, start, fixed},
+        stream);
+  a.theta = start;
+  a.fixed = fixed;
+}
+
+template <class T, int D>
 void HeatSteps<T, D>::read_parameter(const Tensor& t, const char* name) {
   const int64_t P = particles();
   ParameterScenes scenes(in_.scene, in_.scenes);
@@ -165,6 +240,8 @@ void HeatSteps<T, D>::make_nodes() {
     theta_ = empty(in_.x, {nodes});
     capacity_ = empty(in_.x, {nodes});
     increment_ = empty(in_.x, {nodes});
+    if (held_nodes() > 0) start_ = empty(in_.x, {nodes}), fixed_ = empty(in_.x, {nodes}, ScalarType::Bool);
+    if (holds_surface()) exchange_ = empty(in_.x, {nodes}), source_ = empty(in_.x, {nodes});
     workspace_ = Tensor();
   }
   clear(sums_);
@@ -246,6 +323,8 @@ void HeatSteps<T, D>::solve(const Field<const T>& x, const Field<const int>& sce
   for (double& bound : bounds_) bound *= in_.lattice.inverse_inertia() * in_.lattice.dx() * in_.lattice.dx();
   a.scene_bound = bounds_.data();
   a.deterministic = in_.lattice.deterministic();
+  if (held_nodes() > 0) hold_nodes(a, stream);
+  if (holds_surface()) a.exchange = field<const T>(exchange_).pointer, a.source = field<const T>(source_).pointer;
   a.increment = static_cast<T*>(increment_.data_ptr());
   a.iterations = static_cast<int*>(iterations_.data_ptr());
   a.residual = static_cast<T*>(residual_.data_ptr());
@@ -253,7 +332,7 @@ void HeatSteps<T, D>::solve(const Field<const T>& x, const Field<const int>& sce
   if (!workspace_.defined()) workspace_ = empty(in_.x, {backend::heat_workspace(a, stream)}, ScalarType::Byte);
   a.workspace = workspace_.data_ptr();
   backend::heat_cg(in_.lattice.order(), a, stream);
-  backend::heat_increments(HeatIncrementsArguments<T, D>{nodes, a.increment, sums}, stream);
+  backend::heat_increments(HeatIncrementsArguments<T, D>{nodes, a.increment, a.theta, theta, sums}, stream);
 }
 
 // Adds the solves and fronts of a substep to the status.

@@ -60,6 +60,9 @@ namespace mpm {
   X(INT, heat_transfer, heat_transfer)                    \
   X(FLOAT, heat_tolerance, heat_tolerance)                \
   X(INT, heat_iterations, heat_iterations)                \
+  X(INTS, held_obstacles, held_obstacles)                 \
+  X(INT, held_surface, held_surface)                      \
+  X(OPTIONAL, held_temperatures, held_temperatures)       \
   X(FLOATS, lattice, lattice_numbers)                     \
   X(INTS, layout, lattice_layout)                         \
   X(CHOICE, schedule, schedule)

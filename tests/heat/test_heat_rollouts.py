@@ -47,7 +47,7 @@ def scene(dim=3, dtype=torch.float64, scenes=1, law="neo_hookean", **options):
         state = state.replace(material=(torch.arange(count) % len(laws)).int())
     step = mpm.Step(
         grid, mpm.Mixture([each() for each in laws]) if law == "mixture" else laws[0](), (0.0, -10.0, 0.0)[:dim],
-        "separate", boundaries=[mpm.Sphere((0.5, 0.2, 0.5)[:dim], 0.1, friction=0.2)], heat=heat, **options,
+        "separate", boundaries=[mpm.Sphere((0.51, 0.22, 0.48)[:dim], 0.1, friction=0.2)], heat=heat, **options,
     )  # fmt: skip
     return step, step.prepare(state)
 
@@ -136,6 +136,59 @@ def test_stiff_conduction_agrees():
     compare(step, state, 5, tolerance=1e-6)
 
 
+def bodies(dim):
+    """Obstacles of each shape with a kernel, near the block."""
+    at, up = (0.45, 0.25, 0.45)[:dim], (0.1, 1.0, 0.2)[:dim]
+    ball = mpm.shapes.Sphere(0.11)
+    return {
+        "plane": mpm.Plane((0.0, 0.27, 0.0)[:dim], up),
+        "sphere": mpm.Sphere(at, 0.12, velocity=(3.0, 1.0, -2.0)[:dim]),
+        "box": mpm.Box(at, (0.3, 0.15, 0.2)[:dim], rotation=0.3 if dim == 2 else (0.1, 0.2, 0.3)),
+        "capsule": mpm.Capsule(at, up, 0.1, angular_velocity=20.0 if dim == 2 else (0.0, 0.0, 20.0)),
+        "revolved": mpm.boundaries.Revolved(at, ((0.0, 0.0), (0.2, 0.0), (0.0, 0.15)), up),
+        "torus": mpm.Obstacle(mpm.shapes.Torus((0.0, 0.12, 0.0)[:dim], 0.07), at),
+        "sampled": mpm.Obstacle(mpm.shapes.Sampled.of(ball, (-0.2,) * dim, (0.2,) * dim, 0.02), at),
+        "path": mpm.Sphere(lambda t: torch.stack([0.45 + 5 * t, *[0.3 + 0 * t] * (dim - 1)], -1), 0.12),
+        "for a time": mpm.Sphere(at, 0.12, start=2.5 * DT, end=6.5 * DT),
+    }
+
+
+def held(step, *terms):
+    """The step with obstacles that hold a temperature."""
+    step.heat.boundaries = [kind(region, temperature) for kind, region, temperature in terms]
+    step.boundaries = list(dict.fromkeys([*step.boundaries.entries, *(region for _, region, _ in terms)]))
+    return step
+
+
+@pytest.mark.parametrize("kind", [heat_boundaries.Fixed, heat_boundaries.FixedSurface])
+@pytest.mark.parametrize("shape", bodies(2))
+def test_held_obstacles(dim, shape, kind):
+    step, state = scene(dim, melts=True)
+    region = bodies(dim)[shape]
+    end = compare(held(step, (kind, region, 40.0)), state, 10)
+    alone, start = scene(dim, melts=True)
+    alone.boundaries = step.boundaries
+    with torch.no_grad():
+        without = mpm.rollout(alone, start, 10, DT)
+    assert float((end.temperature - without.temperature).abs().max()) > 1e-3
+
+
+@pytest.mark.parametrize("dt", [DT, torch.tensor([1.0, 2.0, 0.5], dtype=torch.float64) * DT])
+def test_held_obstacles_of_scenes(dt):
+    """Obstacles of single scenes and of all, nodes and a surface, temperatures for each scene."""
+    step, state = scene(2, scenes=3)
+    own = mpm.Sphere((0.4, 0.3), 0.1, scene=1)
+    every = mpm.Box(torch.tensor([[0.3, 0.3], [0.6, 0.3], [0.45, 0.6]]), (0.2, 0.1), velocity=(1.0, 0.5))
+    floor = mpm.Plane((0.0, 0.27), (0.0, 1.0))
+    temperatures = torch.tensor([30.0, -20.0, 5.0])
+    terms = (
+        (heat_boundaries.FixedSurface, every, temperatures),
+        (heat_boundaries.Fixed, own, 50.0),
+        (heat_boundaries.Fixed, floor, torch.tensor([7.0])),
+    )
+    compare(held(step, *terms), state, 10, dt)
+
+
 @pytest.mark.parametrize("bounds", [[4e-7], [8e-4], [2e-2], [4e-7, 8e-4, 2e-2], [8e-4, 2e-2, 4e-7]])
 def test_short_solves_reach_the_tolerance(dim, bounds):
     """Changes of temperature at bounds of the spectrum that need one, two or more steps of the solver, against solves
@@ -206,7 +259,14 @@ def _of_function(step):
 
 
 REFUSED = {
-    "its heat has boundaries": lambda s: setattr(s.heat, "boundaries", [heat_boundaries.Source(1.0)]),
+    "a boundary that is not held, Source": lambda s: setattr(s.heat, "boundaries", [heat_boundaries.Source(1.0)]),
+    "is no obstacle of the step": lambda s: setattr(
+        s.heat, "boundaries", [heat_boundaries.Fixed(mpm.Sphere((0.4, 0.4), 0.1), 1.0)]
+    ),
+    "is a function": lambda s: held(s, (heat_boundaries.Fixed, mpm.Sphere((0.4, 0.4), 0.1), lambda t: t)),
+    "several surfaces are held": lambda s: held(
+        s, *[(heat_boundaries.FixedSurface, mpm.Sphere((0.4, 0.4), r), 1.0) for r in (0.1, 0.2)]
+    ),
     "its heat is solved by multigrid": lambda s: setattr(s.heat, "method", "multigrid"),
     "the law dissipates energy into heat": lambda s: setattr(s.heat, "plastic_heating", 0.5),
     "another stress form than mls": lambda s: setattr(s, "stress_form", "gradient"),
@@ -261,6 +321,16 @@ def test_raw_op():
         "heat_iterations must be positive": {"heat_iterations": 0},
         "heat needs wants_C": {"wants_C": False, "apic": False},
         "without gradients": {"resident": False},
+        "held_obstacles must be 0 to 0, got 1": {
+            "held_obstacles": [1],
+            "held_temperatures": torch.ones(1, 1).double(),
+        },
+        "held_obstacles needs held_temperatures": {"held_obstacles": [0]},
+        "held_surface needs held_obstacles": {"held_surface": 1},
+        "held_temperatures must have shape .1, 1.": {
+            "held_obstacles": [0],
+            "held_temperatures": torch.ones(2, 1).double(),
+        },
     }
     for message, change in wrong.items():
         with pytest.raises(RuntimeError, match=message):

@@ -4,7 +4,8 @@
         laws, options, parameters, variables, n, dt, apic, flip, wants_C, stress_form, gravity, wall_kind, wall_plane,
         wall_friction, obstacles, data, shape, sizes, contact, obstacle_scene, start, end, time, scenes,
         max_blocks, grows, resident, records, impulse, scene_dt, scene_time, heat, temperature_gradient,
-        heat_transfer, heat_tolerance, heat_iterations, lattice, layout, schedule=-1)
+        heat_transfer, heat_tolerance, heat_iterations, held_obstacles, held_surface, held_temperatures, lattice,
+        layout, schedule=-1)
         -> (x, v, C, F, J, history, status, impulse, time, residual, heat, heat_status, record)
 
 `torch_mpm.substeps_arguments(step, state, n, dt)` returns the arguments; docs/training.md has an example.
@@ -27,9 +28,10 @@ is `State.x_residual`; without it positions are not compensated.
 Heat is conducted where `heat` is not empty, on the CPU and without gradients: temperature [P], conductivity and
 specific heat, and, for materials that melt, liquid fraction [P], melting point and latent heat; parameters are [], [1],
 [B] or [P]. `heat_transfer` is a number in `TRANSFERS` of torch_mpm.heat, `temperature_gradient` [P, D] belongs to the
-first two. The result `heat` [P, m] has temperature, gradient and liquid fraction in its first columns, `heat_status`
-[B, 3] the number of solves that missed the tolerance, their largest residual [K], and the largest diffusion number of
-particles whose liquid fraction changed.
+first two. `held_obstacles` are numbers of obstacles that hold the nodes in them at `held_temperatures` [K, B]; with
+`held_surface` the last of them holds its surface. The result `heat` [P, m] has temperature, gradient and liquid
+fraction in its first columns, `heat_status` [B, 3] the number of solves that missed the tolerance, their largest
+residual [K], and the largest diffusion number of particles whose liquid fraction changed.
 
 `schedule` is the number of a schedule in the order of csrc/rollout/plan.h; -1 chooses the fastest. A schedule that does
 not support the call is an error with the reason; its sums may round differently.

@@ -7,6 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..errors import shape_of
+from ..heat.boundaries import Fixed, FixedSurface
 from ..heat.heat import GRADIENT, TRANSFERS, Heat
 from ..laws.parameters import PerMaterial, check_length, evaluate, needed_temperature
 from ..laws.thermal import LIQUID
@@ -25,8 +27,8 @@ def why_not_fused_heat(step: Step, state: State, dt: float | Tensor) -> str | No
         return f"{type(heat).__name__} may do more than a Heat"
     if heat.grid is not step.grid:
         return "its heat has another grid"
-    if len(heat.boundaries):
-        return "its heat has boundaries"
+    if (reason := _why_not_held(step, heat)) is not None:
+        return reason
     if heat.method != "cg":
         return f"its heat is solved by {heat.method}"
     if heat.plastic_heating:
@@ -43,6 +45,47 @@ def why_not_fused_heat(step: Step, state: State, dt: float | Tensor) -> str | No
         ):
             return "it conducts heat, and a gradient is wanted"
     return None
+
+
+def _why_not_held(step: Step, heat: Heat) -> str | None:
+    """Reason why the op does not hold the temperatures of the boundaries; None if it does."""
+    for term in heat.boundaries.entries:
+        name = type(term).__name__
+        if type(term) not in (Fixed, FixedSurface):
+            return f"its heat has a boundary that is not held, {name}"
+        if not any(term.region is obstacle for obstacle in step.boundaries.entries):
+            return f"the region of {name} is no obstacle of the step"
+        value = term.temperature
+        if _is_function(value) or (isinstance(value, Tensor) and value.requires_grad):
+            return f"the temperature of {name} is a function, or requires a gradient"
+    if sum([type(term) is FixedSurface for term in heat.boundaries.entries]) > 1:
+        return "several surfaces are held"
+    return None
+
+
+def _held(step: Step, x: Tensor) -> tuple[list[int], int, Tensor | None]:
+    """Numbers of the obstacles that hold a temperature, that of a `FixedSurface` last; whether there is one; and the
+    temperatures [K, B]."""
+    assert step.heat is not None
+    terms = sorted(step.heat.boundaries.entries, key=lambda term: type(term) is FixedSurface)
+    if not terms:
+        return [], 0, None
+    scenes, obstacles = step.grid.scenes, step.boundaries.entries
+    numbers = [next(k for k, o in enumerate(obstacles) if o is term.region) for term in terms]
+    rows = [held_temperatures(term.temperature, x, scenes) for term in terms]
+    return numbers, int(type(terms[-1]) is FixedSurface), torch.stack(rows)
+
+
+def held_temperatures(value: Any, like: Tensor, scenes: int) -> Tensor:
+    """A temperature for each scene [B].
+
+    Raises:
+        ValueError: for another shape.
+    """
+    given = torch.as_tensor(value, dtype=like.dtype, device=like.device)
+    if given.shape not in ((), (1,), (scenes,)):
+        raise ValueError(f"temperature must have shape [], [1] or [B] = [{scenes}], got {shape_of(given)}")
+    return given.detach().reshape(-1).expand(scenes)
 
 
 def _is_function(value: Any) -> bool:
@@ -62,10 +105,11 @@ def _fields(heat: Heat, state: State) -> tuple[Tensor | None, ...]:
     return state.temperature, state.extra.get(GRADIENT), state.extra.get(LIQUID)
 
 
-def heat_arguments(heat: Heat | None, state: State) -> tuple[Any, ...]:
-    """The arguments of the op from `heat` to `heat_iterations`."""
+def heat_arguments(step: Step, state: State) -> tuple[Any, ...]:
+    """The arguments of the op from `heat` to `held_temperatures`."""
+    heat = step.heat
     if heat is None:
-        return [], None, 0, 0.5, 1
+        return [], None, 0, 0.5, 1, [], 0, None
     temperature, scenes = needed_temperature(state), heat.grid.scenes
     names = ("conductivity", "specific_heat", "melting_point", "latent_heat")
     values = []
@@ -75,13 +119,8 @@ def heat_arguments(heat: Heat | None, state: State) -> tuple[Any, ...]:
         values.append(torch.as_tensor(number, dtype=temperature.dtype, device=temperature.device))
     melting = [state.extra[LIQUID], *values[2:]] if heat.melts else []
     gradient = state.extra[GRADIENT] if heat.affine else None
-    return (
-        [temperature, *values[:2], *melting],
-        gradient,
-        TRANSFERS.index(heat.transfer),
-        heat.tolerance,
-        heat.max_iterations,
-    )
+    how = TRANSFERS.index(heat.transfer), heat.tolerance, heat.max_iterations
+    return [temperature, *values[:2], *melting], gradient, *how, *_held(step, state.x)
 
 
 def heat_changes(heat: Heat, state: State, packed: Tensor, status: Tensor) -> tuple[Tensor, dict[str, Tensor]]:

@@ -156,7 +156,7 @@ def _arguments(
         *(table, *others),
         *(0.0 if scene_time is not None else float(state.time), grid.scenes),
         *(pool if blocks is None else max(pool, blocks), grid.grows, not with_gradient, with_gradient and records),
-        *(state.impulse, scene_dt, scene_time, *heat_arguments(step.heat, state), *grid.packed),
+        *(state.impulse, scene_dt, scene_time, *heat_arguments(step, state), *grid.packed),
         -1 if schedule is None else SCHEDULES.index(schedule),
     )
     return arguments, calls.history_names

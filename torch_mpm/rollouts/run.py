@@ -69,9 +69,9 @@ def rollout(
         plan: the plan of `plan_rollout` for these steps, in place of `checkpoint`, `graph` and `schedule`. None: the
             rollout makes it.
 
-    A `Step` of compiled laws without user functions computes all steps in one op, or in a few calls of it. With heat it
-    does so on the CPU without gradients, if the heat has neither boundaries nor plastic heating. `Step.explain` returns
-    the executor, the schedule and the reasons. The results are those of single steps. On
+    A `Step` of compiled laws without user functions computes all steps in one op, or in a few calls of it. With
+    heat it does so on the CPU without gradients, if the only boundaries of the heat are held obstacles of the step.
+    `Step.explain` returns the executor, the schedule and the reasons. The results are those of single steps. On
     CUDA they are bitwise equal, with two exceptions, which round differently, as all steps on a CPU do:
 
     - float32 without gradients;

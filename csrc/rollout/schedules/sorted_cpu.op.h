@@ -202,9 +202,9 @@ bool SortedCpu<T, D>::step(const int* status_before, int* status, int64_t follow
   else if (!begin(status_before, status, following))
     return false;
   s_.move_nodes(stream_);
-  s_.end_time(stream_);
   lasts_ = lasts(following);
-  if (!lasts_) advance();
+  if (!lasts_) advance();  // heat reads the obstacles of this time
+  s_.end_time(stream_);
   return true;
 }
 
