@@ -8,12 +8,9 @@ import torch
 from torch import Tensor
 
 from ...state.state import State
-from ...step.particle_operations import Timed
+from ...step.particle_operations import Timed, of_particles
 from ..gradients import Numbers
 from ..selections import in_box
-
-LAYERS = 50
-"""Number of layers of a sequential release."""
 
 
 class WithoutAffine(Timed):
@@ -36,7 +33,68 @@ class DampedAffine(Timed):
         return state.replace(C=state.C - self.share / 2 * (state.C + state.C.mT))
 
 
-def release_times(x: Tensor, normal: Numbers, start: float, end: float, end_time: float) -> Tensor:
+class Acceleration(Timed):
+    """v ← v + dt a of some particles.
+
+    Args:
+        acceleration: [m/s²], three numbers or a tensor [3] that may require grad.
+        start, end, particles: see `Timed`.
+    """
+
+    def __init__(self, acceleration: Numbers, start: float, end: float, particles: Tensor) -> None:
+        super().__init__(start, end, particles)
+        self.acceleration = acceleration
+
+    def forward(self, state: State, dt: float | Tensor) -> State:
+        acting = self.acting(state)
+        if acting is False:
+            return state
+        change = dt * torch.as_tensor(self.acceleration, dtype=state.v.dtype, device=state.v.device)
+        return state.replace(v=torch.where(acting[:, None], state.v + change, state.v))  # type: ignore[index]
+
+
+class Enabled(Timed):
+    """Particles of a mask [P] take part in the steps; others stay as they are."""
+
+    def forward(self, state: State, dt: float | Tensor) -> tuple[State, Tensor]:
+        assert self.particles is not None
+        return state, of_particles("particle_selection", self.particles, state, (len(state),))
+
+
+class Clipped(Timed):
+    """Moves positions between two bounds [m], numbers."""
+
+    def __init__(self, lower: float, upper: float) -> None:
+        super().__init__()
+        self.lower, self.upper = lower, upper
+
+    def forward(self, state: State, dt: float | Tensor) -> State:
+        return state.replace(x=state.x.clamp(self.lower, self.upper))
+
+
+class Anchored(Timed):
+    """Keeps the particles of a mask [P] at rest and undeformed, at the positions of a state."""
+
+    def __init__(self, state: State, particles: Tensor) -> None:
+        super().__init__(particles=particles)
+        assert state.F is not None
+        self.x, self.F = state.x.detach(), state.F.detach()
+
+    def forward(self, state: State, dt: float | Tensor) -> State:
+        assert self.particles is not None and state.C is not None and state.F is not None
+        held = of_particles("particles", self.particles, state, (len(state),))
+        x = of_particles("x", self.x, state, tuple(self.x.shape))
+        F = of_particles("F", self.F, state, tuple(self.F.shape))
+        row, matrix = held[:, None], held[:, None, None]
+        return state.replace(
+            x=torch.where(row, x, state.x),
+            v=torch.where(row, 0, state.v),
+            C=torch.where(matrix, 0, state.C),
+            F=torch.where(matrix, F, state.F),
+        )
+
+
+def release_times(x: Tensor, normal: Numbers, start: float, end: float, end_time: float, layers: int) -> Tensor:
     """Release time of each particle [P] [s]; immediate where it is in no layer.
 
     Layer k of n holds the particles nearer to `end` than (n − k)/n of the way from `start` until (k + 1)/n of the time,
@@ -47,7 +105,24 @@ def release_times(x: Tensor, normal: Numbers, start: float, end: float, end_time
         if normal[i] != 0:
             axis, point[i], size[i] = i, end, 0.0
     times = torch.full_like(x[:, 0], -math.inf, dtype=torch.float64)
-    for k in range(LAYERS):
-        size[axis] = abs(start - end) / LAYERS * (LAYERS - k)
-        times = torch.where(in_box(x, point, size), end_time / LAYERS * (k + 1), times)
+    for k in range(layers):
+        size[axis] = abs(start - end) / layers * (layers - k)
+        times = torch.where(in_box(x, point, size), end_time / layers * (k + 1), times)
+    return times
+
+
+def release_times_in_boxes(
+    x: Tensor, normal: Numbers, start: float, end: float, layers: int, end_time: float, point: Numbers, size: Numbers
+) -> Tensor:
+    """Release time of each particle [P] [s], as `release_times`: layer k holds the particles nearer to `start` than
+    k/n of the distance to `end`, and in a box about a point on the axes without a normal.
+    """
+    centre, half, axis = list(point), list(size), -1
+    for i in range(3):
+        if normal[i] != 0:
+            axis, centre[i] = i, start
+    times = torch.full_like(x[:, 0], -math.inf, dtype=torch.float64)
+    for k in range(layers):
+        half[axis] = abs(start - end) / layers * k
+        times = torch.where(in_box(x, centre, half), end_time / layers * (k + 1), times)
     return times

@@ -1,0 +1,247 @@
+"""Substeps of PhysGaussian's simulator: requested one by one, computed together."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ...errors import check_number
+from ...grid.grid import Grid
+from ...laws import Material
+from ...rollouts import rollout
+from ...state.state import State
+from ...step.particle_operations import Operations, Timed
+from ...step.step import Step
+from ..node_conditions import NodeDamping
+from .condition_list import Nodes, acts, changes
+from .descendants import DescendantMethods, warn_of_flip
+from .law_choice import chosen_law, kinds_of, law_indices, needs_moduli
+from .particles import Anchored, Clipped, DampedAffine, Enabled, WithoutAffine
+
+DEFAULT_FLIP = 0.8
+"""Share of FLIP of GaussianFluent."""
+
+
+class Pending(NamedTuple):
+    """Substeps that are not computed yet."""
+
+    steps: int = 0
+    dt: float = 0.0
+    grad: bool = True
+    """Whether gradients are needed."""
+    flip: float | None = None
+    """Share of FLIP; None for APIC."""
+
+
+class Substeps(DescendantMethods):
+    """The clock of a simulator, and the steps up to it."""
+
+    strict: bool
+    time_profile: dict[str, list[float]]
+    _codes: Tensor | None
+    _moduli: dict[str, Any] | None
+    _law: Material | None
+    _step: Step | None
+    _damping: NodeDamping | None
+    _selections: dict[str, Tensor]
+    _pending: Pending
+
+    @property
+    def time(self) -> float:
+        """[s]"""
+        return self._start_time + self._pending.steps * self._pending.dt
+
+    @property
+    def _start_time(self) -> float:
+        return 0.0 if self._state is None else float(self._state.time)
+
+    def p2g2p(
+        self,
+        step: Any = None,
+        dt: float | None = None,
+        device: Any = None,
+        flip_pic_ratio: float | None = None,
+        flip_pic: bool | None = None,
+    ) -> None:
+        """A substep of dt [s]; `step` is not used.
+
+        In the dialect of MotionPhysics the first argument is dt. In that of GaussianFluent the substep blends PIC with
+        a share `flip_pic_ratio` of FLIP, unless `flip_pic` is False.
+        """
+        if self.dialect.name == "motionphysics" and not isinstance(dt, (int, float)):
+            dt = step
+        if dt is None:
+            raise TypeError("p2g2p needs step and dt; with dt alone, the simulator must have dialect='motionphysics'")
+        check_number("dt", dt, "positive", lambda v: v > 0)
+        flip = self._share_of_flip(flip_pic_ratio, flip_pic)
+        wanted = Pending(1, dt, torch.is_grad_enabled(), flip)
+        if self._pending[1:] != wanted[1:]:
+            self._flush()
+            self._check_ready()
+            self._pending = wanted
+        else:
+            self._pending = self._pending._replace(steps=self._pending.steps + 1)
+
+    def _share_of_flip(self, ratio: float | None, flip_pic: bool | None) -> float | None:
+        if self.dialect.name != "gaussianfluent":
+            if ratio is not None or flip_pic is not None:
+                raise ValueError("flip_pic_ratio and flip_pic need dialect='gaussianfluent'")
+            return None
+        if flip_pic is False:
+            return None
+        if not self._warned_of_flip:
+            self._warned_of_flip = True
+            warn_of_flip()
+        given = self.parameters.get("flip_pic_ratio", DEFAULT_FLIP) if ratio is None else ratio
+        return float(check_number("flip_pic_ratio", float(given), "between 0 and 1", lambda v: 0 <= v <= 1))
+
+    _warned_of_flip = False
+
+    def print_time_profile(self) -> None:
+        """Print the time of the substeps so far [ms]; on CUDA that of their launch, except where results were read."""
+        print("MPM Time profile:")
+        for name, times in self.time_profile.items():
+            print(name, sum(times))
+
+    # ---- the material
+
+    def _check_ready(self) -> None:
+        state = self._loaded()
+        kinds = kinds_of(self.dialect, self.parameters.get("material", "jelly"), self._codes)
+        if self._moduli is None and needs_moduli(kinds):
+            raise ValueError("the material is not known: call set_parameters_dict and finalize_mu_lam before p2g2p")
+        if "density" not in self.parameters and not bool((state.mass > 0).all()):
+            raise ValueError("the particles have no mass: give density in set_parameters_dict")
+        if self._law is None:
+            self._law = chosen_law(self.dialect, self.parameters | (self._moduli or {}), self._codes)
+            held = [kind == "stationary" for _, kind in kinds]
+            self._anchored = self._anchor(state, held) if any(held) else None
+            self._step = None
+        if state.J is None and "J" in self._law.state_fields:
+            assert state.F is not None
+            self._state = state.replace(J=torch.linalg.det(state.F))
+        if len(kinds) > 1 and self._codes is not None and state.material is None:
+            self._state = self._loaded().replace(material=law_indices(self._codes))
+
+    _anchored: Anchored | None = None
+
+    def _anchor(self, state: State, held: list[bool]) -> Anchored:
+        """Operation that keeps the particles of stationary materials where they are."""
+        if self._codes is None:
+            return Anchored(state, torch.ones_like(state.mass, dtype=torch.bool))
+        indices = law_indices(self._codes).long()
+        return Anchored(state, torch.tensor(held, device=indices.device)[indices])
+
+    def _stress(self) -> Tensor:
+        self._check_ready()
+        assert self._law is not None
+        return self._law.stress(self._loaded())
+
+    # ---- the steps
+
+    def _before_change(self) -> None:
+        self._flush()
+
+    def _flush(self) -> None:
+        """Compute the pending substeps: in parts that begin where conditions by torch operations begin or end."""
+        (steps, dt, grad, flip), self._pending = self._pending, Pending()
+        if steps == 0:
+            return
+        began = time.perf_counter()
+        with torch.set_grad_enabled(grad):
+            self._check_ready()
+            conditions = [*self._boundaries(self._nodes), *self._pushes, *self._holds]
+            first, done = self._start_time, 0
+            for end in changes(conditions, first, steps, dt):
+                self._advance(first + done * dt, end - done, dt, flip)
+                done = end
+        self.time_profile.setdefault("substeps", []).append(1e3 * (time.perf_counter() - began))
+
+    def _advance(self, first: float, count: int, dt: float, flip: float | None) -> None:
+        """The substeps between two changes of conditions."""
+        before, last = self._loaded(), first + (count - 1) * dt
+        if flip is not None:
+            step = self._ready_step(first, last, dt, flip)
+            self._state = rollout(step, before, count, dt).replace(C=before.C)
+        elif self._is_pic and count > 1:  # PIC needs no C, which the last substep alone computes.
+            state = rollout(self._ready_step(first, last, dt, 0.0), before, count - 1, dt).replace(C=before.C)
+            self._state = rollout(self._ready_step(first, last, dt), state, 1, dt)
+        else:
+            self._state = rollout(self._ready_step(first, last, dt), before, count, dt)
+        for operation in self._corrections:
+            self._state = operation(self._loaded(), dt)
+
+    @property
+    def _is_pic(self) -> bool:
+        damping = self.parameters.get("rpic_damping", 0.0)
+        return not (isinstance(damping, Tensor) and damping.requires_grad) and float(damping) < 0
+
+    @property
+    def _corrections(self) -> list[Timed]:
+        """Operations on the particles before each substep, and after the last one."""
+        clipped, found = self.dialect.clipped, [self._anchored] if self._anchored is not None else []
+        if clipped is None:
+            return [*found]
+        return [*found, Clipped(clipped * self._dx, float(self.parameters["grid_lim"]) - clipped * self._dx)]
+
+    @property
+    def step(self) -> Step:
+        """Step of torch_mpm of the substeps; `simulator.step.check()` reports errors."""
+        self._flushed()
+        self._check_ready()
+        return self._ready_step(self._start_time, math.inf, 0.0)
+
+    def _ready_step(self, first: float, last: float, dt: float, flip: float | None = None) -> Step:
+        """Step with the conditions that are active at times from `first` to `last`.
+
+        Args:
+            flip: share of FLIP over PIC; None for APIC.
+        """
+        if self._step is None:
+            assert self._law is not None
+            grid = Grid(self._dx, (0.0,) * 3, (float(self.parameters["grid_lim"]),) * 3)
+            self._step = Step(grid, self._law, gravity=self.parameters.get("g"), stress_form="gradient")
+            self._acting: tuple[list[Any], list[Any]] = ([], [])
+            self._made = self._corrections, self._enabled(), _affine(self.parameters.get("rpic_damping", 0.0))
+        corrections, enabled, affine = self._made
+        nodes = [b for b in self._boundaries(self._nodes) if acts(b, first, last, dt)]
+        nodes = nodes if self._damping is None else [self._damping, *nodes]
+        timed = [o for o in (*self._pushes, *self._holds) if acts(o, first, last, dt)]
+        operations = [*corrections, *timed, *(affine if flip is None else []), *enabled]
+        transfer, share = ("apic", 0.0) if flip is None else ("pic", flip)
+        if (self._step.transfer, self._step.flip) != (transfer, share):
+            self._step.transfer, self._step.flip = transfer, share
+        if nodes != self._acting[0]:
+            self._step.boundaries = nodes  # type: ignore[assignment]
+        if operations != self._acting[1]:
+            self._step.on_particles = Operations(operations) if operations else None
+        self._acting = nodes, operations
+        return self._step
+
+    def _enabled(self) -> list[Timed]:
+        """Operation of `mpm_state.particle_selection`."""
+        selection = self._selections.get("particle_selection")
+        if selection is None or not bool((selection != 0).any()):
+            return []
+        return [Enabled(particles=selection == 0)]
+
+    @property
+    def _nodes(self) -> Nodes:
+        n = int(self.parameters["n_grid"])
+        return Nodes(self._dx, (n, n, n), self._loaded().x[:0], self.strict)
+
+    @property
+    def _dx(self) -> float:
+        return float(self.parameters["grid_lim"]) / int(self.parameters["n_grid"])
+
+
+def _affine(damping: float | Tensor) -> list[Timed]:
+    """Operation of `rpic_damping` on C."""
+    if isinstance(damping, Tensor) and damping.requires_grad:
+        return [DampedAffine(damping)]
+    share = float(damping)
+    return [] if share == 0 else [WithoutAffine() if share < 0 else DampedAffine(share)]
