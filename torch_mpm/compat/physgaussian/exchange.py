@@ -127,12 +127,17 @@ class Exchange:
         return polar(F).R.mT
 
     def _moved_covariance(self) -> Tensor:
-        F, given = self._loaded().F, self.initial_covariance()
+        F = self._loaded().F
         assert F is not None
-        full = given[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].unflatten(1, (3, 3))
-        moved = F @ full @ F.mT
-        return moved.flatten(1)[:, [0, 1, 2, 4, 5, 8]].reshape(-1)
+        return moved_covariance(F, self.initial_covariance())
 
     def _rows(self, matrices: Tensor | None) -> Tensor:
         assert matrices is not None
         return matrices.reshape(-1, 9)
+
+
+def moved_covariance(F: Tensor, given: Tensor) -> Tensor:
+    """F Σ Fᵀ as one row [6 P] of xx xy xz yy yz zz, for F [P, 3, 3] and Σ [P, 6] in this form."""
+    full = given[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].unflatten(1, (3, 3))
+    moved = F @ full @ F.mT
+    return moved.flatten(1)[:, [0, 1, 2, 4, 5, 8]].reshape(-1)

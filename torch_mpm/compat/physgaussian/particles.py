@@ -61,17 +61,6 @@ class Enabled(Timed):
         return state, of_particles("particle_selection", self.particles, state, (len(state),))
 
 
-class Clipped(Timed):
-    """Moves positions between two bounds [m], numbers."""
-
-    def __init__(self, lower: float, upper: float) -> None:
-        super().__init__()
-        self.lower, self.upper = lower, upper
-
-    def forward(self, state: State, dt: float | Tensor) -> State:
-        return state.replace(x=state.x.clamp(self.lower, self.upper))
-
-
 class Anchored(Timed):
     """Keeps the particles of a mask [P] at rest and undeformed, at the positions of a state."""
 
@@ -126,3 +115,16 @@ def release_times_in_boxes(
         half[axis] = abs(start - end) / layers * k
         times = torch.where(in_box(x, centre, half), end_time / layers * (k + 1), times)
     return times
+
+
+def affine_operations(damping: float | Tensor) -> list[Timed]:
+    """Operation of `rpic_damping` on C."""
+    if isinstance(damping, Tensor) and damping.requires_grad:
+        return [DampedAffine(damping)]
+    share = float(damping)
+    return [] if share == 0 else [WithoutAffine() if share < 0 else DampedAffine(share)]
+
+
+def enabled_operations(selection: Tensor | None) -> list[Timed]:
+    """Operation of `particle_selection`: particles that are not 0 stay as they are."""
+    return [] if selection is None or not bool((selection != 0).any()) else [Enabled(particles=selection == 0)]

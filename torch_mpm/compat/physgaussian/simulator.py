@@ -12,7 +12,7 @@ from torch import Tensor
 from ...errors import check_count, check_flag, check_like, shape_of
 from ...laws import Material
 from ...state.state import State, identity_deformation
-from ...step.step import Step
+from ..clipping import ClippedRollout
 from ..gradients import Numbers, check_fixed, vector
 from ..keys import check_needed, checked_list
 from ..node_conditions import NodeDamping
@@ -85,7 +85,7 @@ class MPM_Simulator_WARP(Viewed):
         size = {"n_grid": n_grid, "grid_lim": grid_lim}
         self.parameters: dict[str, Any] = {name: checked(name, value, torch.empty(0)) for name, value in size.items()}
         self._state: State | None = None
-        self._step: Step | None = None
+        self._step: ClippedRollout | None = None
         self._law: Material | None = None
         self._anchored = None
         self._moduli: dict[str, Any] | None = None  # E and nu of the last finalize_mu_lam.

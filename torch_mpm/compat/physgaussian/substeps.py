@@ -10,17 +10,15 @@ import torch
 from torch import Tensor
 
 from ...errors import check_number
-from ...grid.grid import Grid
 from ...laws import Material
-from ...rollouts import rollout
 from ...state.state import State
-from ...step.particle_operations import Operations, Timed
 from ...step.step import Step
+from ..clipping import ClippedRollout
 from ..node_conditions import NodeDamping
 from .condition_list import Nodes, acts, changes
 from .descendants import DescendantMethods, warn_of_flip
 from .law_choice import chosen_law, kinds_of, law_indices, needs_moduli
-from .particles import Anchored, Clipped, DampedAffine, Enabled, WithoutAffine
+from .particles import Anchored, affine_operations, enabled_operations
 
 DEFAULT_FLIP = 0.8
 """Share of FLIP of GaussianFluent."""
@@ -45,7 +43,7 @@ class Substeps(DescendantMethods):
     _codes: Tensor | None
     _moduli: dict[str, Any] | None
     _law: Material | None
-    _step: Step | None
+    _step: ClippedRollout | None
     _damping: NodeDamping | None
     _selections: dict[str, Tensor]
     _pending: Pending
@@ -165,15 +163,20 @@ class Substeps(DescendantMethods):
         """The substeps between two changes of conditions."""
         before, last = self._loaded(), first + (count - 1) * dt
         if flip is not None:
-            step = self._ready_step(first, last, dt, flip)
-            self._state = rollout(step, before, count, dt).replace(C=before.C)
+            self._state = self._rolled(before, count, first, last, dt, flip).replace(C=before.C)
         elif self._is_pic and count > 1:  # PIC needs no C, which the last substep alone computes.
-            state = rollout(self._ready_step(first, last, dt, 0.0), before, count - 1, dt).replace(C=before.C)
-            self._state = rollout(self._ready_step(first, last, dt), state, 1, dt)
+            state = self._rolled(before, count - 1, first, last, dt, 0.0).replace(C=before.C)
+            self._state = self._rolled(state, 1, first, last, dt)
         else:
-            self._state = rollout(self._ready_step(first, last, dt), before, count, dt)
-        for operation in self._corrections:
-            self._state = operation(self._loaded(), dt)
+            self._state = self._rolled(before, count, first, last, dt)
+        if self._anchored is not None:
+            self._state = self._anchored(self._loaded(), dt)
+
+    def _rolled(self, state: State, n: int, first: float, last: float, dt: float, flip: float | None = None) -> State:
+        """State after n substeps."""
+        nodes, operations, transfer, share = self._active(first, last, dt, flip)
+        assert self._step is not None
+        return self._step.run(state, n, dt, nodes, operations, transfer, share)
 
     @property
     def _is_pic(self) -> bool:
@@ -181,53 +184,41 @@ class Substeps(DescendantMethods):
         return not (isinstance(damping, Tensor) and damping.requires_grad) and float(damping) < 0
 
     @property
-    def _corrections(self) -> list[Timed]:
-        """Operations on the particles before each substep, and after the last one."""
-        clipped, found = self.dialect.clipped, [self._anchored] if self._anchored is not None else []
-        if clipped is None:
-            return [*found]
-        return [*found, Clipped(clipped * self._dx, float(self.parameters["grid_lim"]) - clipped * self._dx)]
+    def _bounds(self) -> tuple[float, float] | None:
+        """Bounds of positions after each substep [m]; None without."""
+        cells, dx = self.dialect.clipped, self._dx
+        return None if cells is None else (cells * dx, float(self.parameters["grid_lim"]) - cells * dx)
 
     @property
     def step(self) -> Step:
         """Step of torch_mpm of the substeps; `simulator.step.check()` reports errors."""
         self._flushed()
         self._check_ready()
-        return self._ready_step(self._start_time, math.inf, 0.0)
+        active = self._active(self._start_time, math.inf, 0.0)
+        assert self._step is not None
+        return self._step.whole.with_conditions(*active)
 
-    def _ready_step(self, first: float, last: float, dt: float, flip: float | None = None) -> Step:
-        """Step with the conditions that are active at times from `first` to `last`.
+    def _active(
+        self, first: float, last: float, dt: float, flip: float | None = None
+    ) -> tuple[list[Any], list[Any], str, float]:
+        """Active conditions at times from `first` to `last` on nodes and particles, transfer and share of FLIP.
 
         Args:
             flip: share of FLIP over PIC; None for APIC.
         """
         if self._step is None:
             assert self._law is not None
-            grid = Grid(self._dx, (0.0,) * 3, (float(self.parameters["grid_lim"]),) * 3)
-            self._step = Step(grid, self._law, gravity=self.parameters.get("g"), stress_form="gradient")
-            self._acting: tuple[list[Any], list[Any]] = ([], [])
-            self._made = self._corrections, self._enabled(), _affine(self.parameters.get("rpic_damping", 0.0))
-        corrections, enabled, affine = self._made
+            extent = float(self.parameters["grid_lim"])
+            self._step = ClippedRollout(self._law, self.parameters.get("g"), self._dx, extent, self._bounds)
+            affine = affine_operations(self.parameters.get("rpic_damping", 0.0))
+            self._lasting = affine, enabled_operations(self._selections.get("particle_selection"))
+        affine, enabled = self._lasting
         nodes = [b for b in self._boundaries(self._nodes) if acts(b, first, last, dt)]
         nodes = nodes if self._damping is None else [self._damping, *nodes]
+        anchored = [] if self._anchored is None else [self._anchored]
         timed = [o for o in (*self._pushes, *self._holds) if acts(o, first, last, dt)]
-        operations = [*corrections, *timed, *(affine if flip is None else []), *enabled]
-        transfer, share = ("apic", 0.0) if flip is None else ("pic", flip)
-        if (self._step.transfer, self._step.flip) != (transfer, share):
-            self._step.transfer, self._step.flip = transfer, share
-        if nodes != self._acting[0]:
-            self._step.boundaries = nodes  # type: ignore[assignment]
-        if operations != self._acting[1]:
-            self._step.on_particles = Operations(operations) if operations else None
-        self._acting = nodes, operations
-        return self._step
-
-    def _enabled(self) -> list[Timed]:
-        """Operation of `mpm_state.particle_selection`."""
-        selection = self._selections.get("particle_selection")
-        if selection is None or not bool((selection != 0).any()):
-            return []
-        return [Enabled(particles=selection == 0)]
+        operations = [*anchored, *timed, *(affine if flip is None else []), *enabled]
+        return nodes, operations, *(("apic", 0.0) if flip is None else ("pic", flip))
 
     @property
     def _nodes(self) -> Nodes:
@@ -237,11 +228,3 @@ class Substeps(DescendantMethods):
     @property
     def _dx(self) -> float:
         return float(self.parameters["grid_lim"]) / int(self.parameters["n_grid"])
-
-
-def _affine(damping: float | Tensor) -> list[Timed]:
-    """Operation of `rpic_damping` on C."""
-    if isinstance(damping, Tensor) and damping.requires_grad:
-        return [DampedAffine(damping)]
-    share = float(damping)
-    return [] if share == 0 else [WithoutAffine() if share < 0 else DampedAffine(share)]
