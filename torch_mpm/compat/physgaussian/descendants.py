@@ -14,7 +14,7 @@ from ...state.state import State, identity_deformation
 from ...step.particle_operations import Hold, Push
 from ..gradients import Numbers, check_fixed, refuse_grad, vector
 from .condition_list import AT_REST, ConditionList
-from .dialects import Dialect
+from .dialects import Dialect, code_of
 from .exchange import Exchange
 from .particles import release_times_in_boxes
 
@@ -173,6 +173,16 @@ class DescendantMethods(ConditionList, Exchange):
             f"{x[first].tolist()}; all are in {low} to {high}"
         )
         return True
+
+    def material_2_num(self, material: str) -> int:
+        """Number of a material of the dialect.
+
+        Raises:
+            TypeError: for an unknown material.
+        """
+        if material not in self.dialect.codes:
+            raise TypeError(f"material must be one of {sorted(self.dialect.codes)}, got {material!r}")
+        return code_of(self.dialect, material)
 
     def set_velocity_by_index(
         self,
