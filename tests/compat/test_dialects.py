@@ -8,7 +8,13 @@ import torch
 from compat.restated import EYE, Weights, from_grid, lame, rotations_svd, times, to_grid
 from compat.restated_simulator import DT, DX, LIM, N, Restated, blob, bounding_box, floor, pair, run, shear
 
-from torch_mpm.compat.physgaussian import MPM_Simulator_WARP, decode_param_json, set_boundary_conditions, substeps
+from torch_mpm.compat.physgaussian import (
+    BatchedSimulator,
+    MPM_Simulator_WARP,
+    decode_param_json,
+    set_boundary_conditions,
+    substeps,
+)
 from torch_mpm.compat.physgaussian.clay import NonAssociativeCamClay
 from torch_mpm.compat.physgaussian.dialects import DIALECTS
 from torch_mpm.state.state import State
@@ -541,3 +547,67 @@ def test_defaults_of_a_configuration(dialect, tmp_path):
     sim.set_parameters_dict(parts[0] | {"material": "jelly"})
     sim.finalize_mu_lam()
     assert {*DIALECTS[dialect].keys} - {"bulk_modulus", "spawn_offset"} <= {*sim.parameters}
+
+
+# ---- batches
+
+
+class MovingLeastSquares(Restated):
+    """The step of kywind's warp-mpm: MLS-MPM with 3/4 of the stress, and F moved by C."""
+
+    def p2g2p(self, dt):
+        for act in self.before:
+            act(self, dt)
+        weights = Weights(self.x, DX, N)
+        m, mv = to_grid(weights, N, self.mass, self.v, self.C, self.volume, 0.75 * self.stress(dt), dt, True, DX)
+        v = np.where(m[:, None] > 1e-15, mv / np.maximum(m, 1e-300)[:, None] + dt * self.g, 0)
+        for act in self.on_nodes:
+            act(self, v, dt)
+        self.v, self.C, _ = from_grid(weights, v, DX)
+        self.x, self.F, self.time = self.x + dt * self.v, (EYE + dt * self.C) @ self.F, self.time + dt
+
+
+@pytest.mark.parametrize("material", ["jelly", "metal"])
+def test_a_batch_of_kywind(material, device):
+    """Two scenes with velocities of their own, in [B, P, ...]."""
+    x, volume = blob()
+    parameters = COMMON | {"material": material, "E": 1e5, "yield_stress": 1e3}
+    sim = BatchedSimulator()
+    tensors = (torch.tensor(np.stack([a, a]), device=device) for a in (x, volume))
+    sim.load_initial_data_from_torch(*tensors, batch_size=2, dx=DX, grid_lim=[1.0, 1.0, 1.0 + DX / 2], device=device)
+    scenes = [MovingLeastSquares(x, volume, **parameters) for _ in range(2)]
+    for k, own in enumerate(scenes):
+        own.v = (k + 1) * shear(x)
+        own.on_nodes += [floor(0.33), bounding_box]
+    sim.import_particle_v_from_torch(torch.tensor(np.stack([own.v for own in scenes]), device=device))
+    sim.set_parameters_dict(parameters)
+    sim.add_surface_collider((0.5, 0.5, 0.33), (0.0, 0.0, 1.0))
+    sim.add_bounding_box()
+    sim.finalize_mu_lam()
+    for k in range(25):
+        sim.p2g2p(k, DT)
+        for own in scenes:
+            own.p2g2p(DT)
+    assert np.abs(sim.export_particle_x_to_torch().cpu().numpy() - np.stack([own.x for own in scenes])).max() < 1e-9
+    shapes = {"v": (2, 64, 3), "F": (2, 64, 9), "C": (2, 64, 9), "R": (2, 64, 9), "cov": (2, 384)}
+    for name, shape in shapes.items():
+        assert getattr(sim, f"export_particle_{name}_to_torch")().shape == shape
+    assert sim.mpm_state.particle_x.shape == (2, 64, 3) and sim.mpm_model.n_grid_z == N
+    assert sim.mpm_model.batch_size == 2 and float(sim.mpm_model.mu[0]) == pytest.approx(MU)
+    with pytest.raises(ValueError, match="n_grid must not be given: kywind's warp-mpm has dx in its place"):
+        sim.set_parameters_dict({"n_grid": 10})
+    sim.set_parameters_dict({"dx": 0.1})
+    assert sim.mpm_model.n_grid_x == 10
+
+
+def test_a_batch_from_a_sampling(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    x, volume = blob()
+    with h5py.File(tmp_path / "points.h5", "w") as file:
+        file["x"], file["particle_volume"] = x.T, volume[None]
+    sim = BatchedSimulator()
+    sim.load_from_sampling(str(tmp_path / "points.h5"), batch_size=3, dx=DX, fps=8)
+    found = sim.export_particle_x_to_torch()
+    assert found.shape == (3, 8, 3) and torch.equal(found[0], found[2])
+    apart = torch.cdist(found[0], found[0]) + 9 * torch.eye(8)
+    assert float(apart.min()) > 0.12

@@ -61,7 +61,13 @@ def test_keys_of_another_dialect(key, tmp_path):
         decode_param_json(written(tmp_path, {key: 1.0}), "physgaussian")
 
 
-@pytest.mark.parametrize("dialect", dialects.DIALECTS)
+def test_dialects_with_batches():
+    for call in (lambda: solver(dialect="kywind"), lambda: solver().set_parameters_dict({"dx": 0.1})):
+        with pytest.raises(ValueError, match=r"dialect must not be 'kywind', .* need BatchedSimulator"):
+            call()
+
+
+@pytest.mark.parametrize("dialect", [name for name in dialects.DIALECTS if name != "kywind"])
 def test_typing_errors_in_a_dialect(dialect):
     for key in dialects.DIALECTS[dialect].keys:
         with pytest.raises(ValueError, match=f"'{key}s' is unknown, the nearest known key is '{key}'"):

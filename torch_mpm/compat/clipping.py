@@ -49,32 +49,37 @@ class ActingStep:
 
 
 class ClippedRollout:
-    """Rollouts on the cube [0, extent]³ with forces by the gradient of the weights.
+    """Rollouts whose positions may be clamped after each step.
 
-    With bounds, positions are clamped after each step. Several steps are computed without, on a smaller grid that
-    reports any particle of any step beyond the bounds, and again with an operation that clamps if there was one; from
-    then on they are clamped.
+    Several steps with bounds are computed without clamping, on a smaller grid that reports any particle of any step
+    beyond the bounds, and again with an operation that clamps if there was one; from then on they are clamped.
 
     Args:
         law: the material.
         gravity: see `Step`.
-        dx: node distance [m].
-        extent: [m]
-        bounds: of positions [m]; None without.
+        grid: the lattice.
+        bounds: of positions [m], multiples of dx; None without.
+        stress_form: see `Step`.
     """
 
     def __init__(
-        self, law: Material, gravity: Any, dx: float, extent: float, bounds: tuple[float, float] | None = None
+        self,
+        law: Material,
+        gravity: Any,
+        grid: Grid,
+        bounds: tuple[float, float] | None = None,
+        stress_form: str = "gradient",
     ) -> None:
-        self._law, self._gravity, self._bounds = law, gravity, bounds
-        self.whole = self._acting(Grid(dx, (0.0,) * 3, (extent,) * 3))
+        self._law, self._gravity, self._bounds, self._stress_form = law, gravity, bounds, stress_form
+        self.whole = self._acting(grid)
         self._clip = None if bounds is None else Clipped(*bounds)
         self._narrow: ActingStep | None = None
+        dx = grid.dx
         if bounds is not None and bounds[1] - bounds[0] >= 3 * dx:  # Reported are particles a cell outside a domain.
-            self._narrow = self._acting(Grid(dx, (bounds[0] + dx,) * 3, (bounds[1] - dx,) * 3))
+            self._narrow = self._acting(Grid(dx, (bounds[0] + dx,) * 3, (bounds[1] - dx,) * 3, grid.scenes))
 
     def _acting(self, grid: Grid) -> ActingStep:
-        return ActingStep(Step(grid, self._law, gravity=self._gravity, stress_form="gradient"))
+        return ActingStep(Step(grid, self._law, gravity=self._gravity, stress_form=self._stress_form))
 
     def run(
         self, state: State, n: int, dt: float, nodes: list[Any], operations: list[Any], transfer: str = "apic",

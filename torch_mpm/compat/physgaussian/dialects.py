@@ -22,6 +22,8 @@ BASE_KEYS = (
 WITHOUT_EFFECT = ("pic_damping", "opacity_threshold", "downsample_scale")
 """Keys that `decode_param_json` of the projects stores among the parameters, and their simulators do not read."""
 BASE_MATERIALS = {name: name for name in ("jelly", "metal", "sand", "foam", "snow", "plasticine")}
+STRESSES = ("E", "yield_stress", "plastic_viscosity", "softening")
+"""Parameters in units of stress."""
 CODES = {"jelly": 0, "metal": 1, "sand": 2, "foam": 3, "snow": 4, "plasticine": 5}
 """Numbers of the materials in `mpm_model.material`."""
 SCALED = {"E": 1e7}
@@ -53,6 +55,8 @@ class Dialect:
         clipped: distance in cells that positions keep from the faces of the domain after each step; None for any.
         layers: number of layers of a sequential release; None for the given number.
         configuration: keys of configurations by which a dialect is recognised.
+        stress_form: form of the forces, see `Step`.
+        stress_factor: factor of the stress in the forces.
     """
 
     name: str
@@ -67,6 +71,8 @@ class Dialect:
     clipped: float | None = None
     layers: int | None = 50
     configuration: tuple[str, ...] = ()
+    stress_form: str = "gradient"
+    stress_factor: float = 1.0
 
     @property
     def known(self) -> tuple[str, ...]:
@@ -77,6 +83,11 @@ class Dialect:
         """A parameter of the dialect in SI units."""
         unit = self.units.get(name, 1.0)
         return value if unit == 1 else unit * value
+
+    def effective(self, name: str, value: Any) -> Any:
+        """A parameter in SI units with which the law has the stress of the forces."""
+        si = self.si(name, value)
+        return self.stress_factor * si if self.stress_factor != 1 and name in STRESSES else si
 
     def sentence(self) -> str:
         """Description of the units."""
@@ -109,6 +120,8 @@ _ALL = [
             defaults={"friction_angle": 45.0}),
     Dialect("zeshunzong", "warp-mpm", keys=("bulk_modulus",), materials={**BASE_MATERIALS, "fluid": "fluid"},
             codes={**CODES, "fluid": 6}),
+    Dialect("kywind", "kywind's warp-mpm", keys=("dx",), without_effect=("rpic_damping",), stress_form="mls",
+            stress_factor=0.75),
     Dialect("warp_mpm", "PhysDreamer", materials={**BASE_MATERIALS, "neo-hookean": "neo-hookean"},
             codes={**CODES, "neo-hookean": 6}, clipped=2.0),
 ]  # fmt: skip
@@ -193,7 +206,6 @@ def check_parameter_keys(dialect: Dialect, given: Iterable[str], what: str = "se
         f"{[d.name for d in _ALL if key in d.known]}, whose units may differ"
         for key in {key for d in _ALL for key in d.known} - set(known)
     }
-    others["dx"] = "others have it in the place of n_grid, which is grid_lim / dx"
     check_keys(what, given, known, others)
 
 

@@ -51,7 +51,7 @@ def chosen_law(dialect: Dialect, parameters: Mapping[str, Any], codes: Tensor | 
         return material
     effective = {used for name, kind in kinds if kind != "snow" for used in check_material(name, kind, parameters)}
     check_gradients(parameters, effective, f"material {kinds[0][0]!r}" if len(kinds) == 1 else "the materials")
-    si = {name: dialect.si(name, value) for name, value in {**dialect.defaults, **parameters}.items()}
+    si = {name: dialect.effective(name, value) for name, value in {**dialect.defaults, **parameters}.items()}
     laws = [law_of(kind, si) for _, kind in kinds]
     return laws[0] if len(laws) == 1 else Mixture(laws)
 

@@ -64,13 +64,19 @@ class MPM_Simulator_WARP(Viewed):
         strict: bool = False,
     ) -> None:
         check_count("n_particles", n_particles)
+        if dialect is not None:
+            _refuse_batches(dialect_of(dialect))
+        self._prepare(dialect, strict)
+        self.initialize(n_particles, n_grid, grid_lim, device)
+
+    def _prepare(self, dialect: str | None, strict: bool) -> None:
+        """Set everything that `initialize` keeps."""
         self._dialect: Dialect | None = None if dialect is None else dialect_of(dialect)
         if self._dialect is not None:
             report(self._dialect)
         self.strict = check_flag("strict", strict)
         self.time_profile: dict[str, list[float]] = {}
         self.mpm_state, self.mpm_model = ParticleView(self), ModelView(self)
-        self.initialize(n_particles, n_grid, grid_lim, device)
 
     @property
     def dialect(self) -> Dialect:  # type: ignore[override]
@@ -119,25 +125,24 @@ class MPM_Simulator_WARP(Viewed):
         if not isinstance(tensor_x, Tensor) or tensor_x.dim() != 2 or tensor_x.shape[1] != 3:
             raise ValueError(f"tensor_x must have shape [P, 3], got {shape_of(tensor_x)}")
         self.initialize(len(tensor_x), n_grid, grid_lim)
-        x = tensor_x.to(device=device)
-        volume = tensor_volume.to(x)
+        self._place(tensor_x.to(device=device), tensor_volume, tensor_cov)
+
+    def _place(self, x: Tensor, volume: Tensor, cov: Tensor | None) -> None:
+        """Particles at rest at positions [P, 3] [m], with volumes [P] [m³]."""
+        volume = volume.to(x)
         check_like("tensor_volume", volume, x, (len(x),), "[P]")
         motion = torch.zeros(len(x), 3, 3, dtype=x.dtype, device=x.device)
         self._state = State(
             x=x, v=torch.zeros_like(x), mass=0 * volume, volume=volume, C=motion, F=identity_deformation(x)
         )
-        if tensor_cov is not None:
-            self.assign_covariance(tensor_cov)
+        if cov is not None:
+            self.assign_covariance(cov)
 
     def load_from_sampling(
         self, sampling_h5: str, n_grid: int = 100, grid_lim: float = 1.0, device: torch.device | str | None = None
     ) -> None:
         """Particles at rest of an HDF5 file with x [3, P] and particle_volume [1, P] (needs h5py)."""
-        import h5py
-
-        with h5py.File(sampling_h5, "r") as file:
-            x, volume = (torch.as_tensor(file[name][()], dtype=torch.float32) for name in ("x", "particle_volume"))
-        self.load_initial_data_from_torch(x.T.contiguous(), volume.reshape(-1), None, n_grid, grid_lim, device)
+        self.load_initial_data_from_torch(*sampled(sampling_h5), None, n_grid, grid_lim, device)
 
     # ---- parameters
 
@@ -199,6 +204,7 @@ class MPM_Simulator_WARP(Viewed):
             found = recognised(given, given.get("material"), boxes={key for box in boxes for key in box})
         if found is None or found is self._dialect:
             return
+        _refuse_batches(found)
         before = [name for name in found.units if name in self.parameters]
         if before:
             raise ValueError(
@@ -216,7 +222,7 @@ class MPM_Simulator_WARP(Viewed):
         history = {"yield_stress": "yield_stress", "alpha_0": "log_plastic_volume"}
         for name, field in history.items():
             if name in names and field in state.extra:
-                value = self.dialect.si(name, self._of_particles(name, state))
+                value = self.dialect.effective(name, self._of_particles(name, state))
                 self._state = state = state.replace(extra={**state.extra, field: value})
 
     def _set_in_box(self, state: State, box: Mapping[str, Any]) -> None:
@@ -347,3 +353,18 @@ class MPM_Simulator_WARP(Viewed):
         """
         layers = num_layers, num_layers if self.dialect.layers is None else self.dialect.layers
         self._release(self._flushed().x, normal, (start_position, end_position), layers, start_time, end_time)
+
+
+def _refuse_batches(dialect: Dialect) -> None:
+    """Refuse the dialect whose simulator has batches."""
+    if dialect.name == "kywind":
+        raise ValueError("dialect must not be 'kywind', whose dx and batches need BatchedSimulator(batch_size=, dx=)")
+
+
+def sampled(file_h5: str) -> tuple[Tensor, Tensor]:
+    """Positions [P, 3] [m] and volumes [P] [m³] of an HDF5 file, float32."""
+    import h5py
+
+    with h5py.File(file_h5, "r") as file:
+        x, volume = (torch.as_tensor(file[name][()], dtype=torch.float32) for name in ("x", "particle_volume"))
+    return x.T.contiguous(), volume.reshape(-1)

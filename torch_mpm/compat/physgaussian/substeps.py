@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ...errors import check_number
+from ...grid.grid import Grid
 from ...laws import Material
 from ...state.state import State
 from ...step.step import Step
@@ -208,8 +209,8 @@ class Substeps(DescendantMethods):
         """
         if self._step is None:
             assert self._law is not None
-            extent = float(self.parameters["grid_lim"])
-            self._step = ClippedRollout(self._law, self.parameters.get("g"), self._dx, extent, self._bounds)
+            grid, form = self._grid(), self.dialect.stress_form
+            self._step = ClippedRollout(self._law, self.parameters.get("g"), grid, self._bounds, form)
             affine = affine_operations(self.parameters.get("rpic_damping", 0.0))
             self._lasting = affine, enabled_operations(self._selections.get("particle_selection"))
         affine, enabled = self._lasting
@@ -219,6 +220,9 @@ class Substeps(DescendantMethods):
         timed = [o for o in (*self._pushes, *self._holds) if acts(o, first, last, dt)]
         operations = [*anchored, *timed, *(affine if flip is None else []), *enabled]
         return nodes, operations, *(("apic", 0.0) if flip is None else ("pic", flip))
+
+    def _grid(self) -> Grid:
+        return Grid(self._dx, (0.0,) * 3, (float(self.parameters["grid_lim"]),) * 3)
 
     @property
     def _nodes(self) -> Nodes:

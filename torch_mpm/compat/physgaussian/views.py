@@ -85,7 +85,7 @@ class ParticleView(_View):
         one = self._simulator
         state = one.state
         if name in ARRAYS:
-            return getattr(state, ARRAYS[name])
+            return one.shaped(getattr(state, ARRAYS[name]))
         if name == "particle_density":
             return one.per_particle("density")
         if name == "particle_init_cov":
@@ -136,7 +136,10 @@ class ModelView(_View):
         "grid_v_damping_scale",
     )
     ARRAYS_OF_PARAMETERS = ("E", "nu", "yield_stress", "mu_N", "lam_N", "viscosity", "beta")
-    SIZES = ("n_grid", "grid_lim", "dx", "inv_dx", "grid_dim_x", "grid_dim_y", "grid_dim_z", "n_particles")
+    SIZES = (
+        *("n_grid", "grid_lim", "dx", "inv_dx", "grid_dim_x", "grid_dim_y", "grid_dim_z", "n_particles", "batch_size"),
+        *("n_grid_x", "n_grid_y", "n_grid_z", "grid_lim_x", "grid_lim_y", "grid_lim_z"),
+    )
     _names = (
         *ARRAYS_OF_PARAMETERS, *NUMBERS, *SIZES, "mu", "lam", "bulk", "kappa", "alpha", "material",
         "gravitational_accelaration", "update_cov_with_F",
@@ -146,7 +149,10 @@ class ModelView(_View):
         one = self._simulator
         parameters = one.parameters
         if name in self.SIZES:
-            return one.sizes()[name]
+            sizes = one.sizes()
+            if name not in sizes:
+                raise AttributeError(f"{name} must be one of {sorted(sizes)} here")
+            return sizes[name]
         if name == "material":
             return one.material_number()
         if name in ("mu", "lam", "bulk", "kappa"):
@@ -181,6 +187,10 @@ class Viewed(Substeps):
         """Set material and numbers of the simulation."""
         raise NotImplementedError
 
+    def shaped(self, rows: Any) -> Any:
+        """A tensor [P, ...] as the simulator returns it."""
+        return rows
+
     def sizes(self) -> dict[str, Any]:
         """Sizes of the grid: n_grid, grid_lim [m], dx [m] and others."""
         n, extent = self.parameters["n_grid"], self.parameters["grid_lim"]
@@ -199,7 +209,7 @@ class Viewed(Substeps):
         """
         state = self.state
         if name == "yield_stress" and name in state.extra:
-            return state.extra[name] / self.dialect.units.get(name, 1.0)
+            return state.extra[name] / self.dialect.effective(name, 1.0)
         value = self.parameters.get(name, 0.0)
         if not isinstance(value, Tensor):
             value = torch.full_like(state.mass, float(value))

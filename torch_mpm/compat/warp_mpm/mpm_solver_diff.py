@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ...errors import check_count, check_flag, check_number
+from ...grid.grid import Grid
 from ...state.state import State
 from ..clipping import ClippedRollout
 from ..keys import check_keys
@@ -258,7 +259,8 @@ class MPMWARPDiff(ParticleConditions):
         parameters |= {name: getattr(model, name) for name in names}
         bounds = MARGIN * model.dx, model.grid_lim - MARGIN * model.dx
         law = chosen_law(DIALECT, parameters, None)
-        roll = ClippedRollout(law, model.gravitational_accelaration, model.dx, model.grid_lim, bounds)
+        grid = Grid(model.dx, (0.0,) * 3, (model.grid_lim,) * 3)
+        roll = ClippedRollout(law, model.gravitational_accelaration, grid, bounds)
         return roll, [*affine_operations(model.rpic_damping), *enabled_operations(selection)]
 
     def _active(
