@@ -62,22 +62,21 @@ class Enabled(Timed):
 
 
 class Anchored(Timed):
-    """Keeps the particles of a mask [P] at rest and undeformed, at the positions of a state."""
+    """Keeps the positions, velocities and deformations that the particles of a mask [P] have in a state, without C."""
 
     def __init__(self, state: State, particles: Tensor) -> None:
         super().__init__(particles=particles)
         assert state.F is not None
-        self.x, self.F = state.x.detach(), state.F.detach()
+        self.x, self.v, self.F = state.x.detach(), state.v.detach(), state.F.detach()
 
     def forward(self, state: State, dt: float | Tensor) -> State:
         assert self.particles is not None and state.C is not None and state.F is not None
         held = of_particles("particles", self.particles, state, (len(state),))
-        x = of_particles("x", self.x, state, tuple(self.x.shape))
-        F = of_particles("F", self.F, state, tuple(self.F.shape))
+        x, v, F = (of_particles(k, t, state, tuple(t.shape)) for k, t in (("x", self.x), ("v", self.v), ("F", self.F)))
         row, matrix = held[:, None], held[:, None, None]
         return state.replace(
             x=torch.where(row, x, state.x),
-            v=torch.where(row, 0, state.v),
+            v=torch.where(row, v, state.v),
             C=torch.where(matrix, 0, state.C),
             F=torch.where(matrix, F, state.F),
         )

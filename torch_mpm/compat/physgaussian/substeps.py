@@ -130,10 +130,11 @@ class Substeps(DescendantMethods):
 
     def _anchor(self, state: State, held: list[bool]) -> Anchored:
         """Operation that keeps the particles of stationary materials where they are."""
+        still = state.replace(v=torch.zeros_like(state.v))
         if self._codes is None:
-            return Anchored(state, torch.ones_like(state.mass, dtype=torch.bool))
+            return Anchored(still, torch.ones_like(state.mass, dtype=torch.bool))
         indices = law_indices(self._codes).long()
-        return Anchored(state, torch.tensor(held, device=indices.device)[indices])
+        return Anchored(still, torch.tensor(held, device=indices.device)[indices])
 
     def _stress(self) -> Tensor:
         self._check_ready()
