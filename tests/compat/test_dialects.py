@@ -398,6 +398,51 @@ def test_arrays_are_read_and_assigned(device):
             call()
 
 
+def test_arrays_are_written_in_place(device):
+    """Materials and selections of particles, between substeps; parameters not while substeps are pending."""
+    parameters = COMMON | {"material": "jelly", "E": 1e5, "yield_stress": 100.0}
+    sim, _ = pair(parameters, shear, device, dialect="pixie")
+    other, _ = pair(parameters, shear, device, dialect="pixie")
+    for one in (sim, other):
+        one.finalize_mu_lam()
+        for k in range(5):
+            one.p2g2p(k, DT)
+    sim.mpm_state.particle_material[:] = 1
+    sim.mpm_state.particle_selection[3] = 1
+    other.set_parameters_dict({"material": "metal"})
+    other.mpm_state.particle_selection = torch.arange(64, device=device).eq(3).int()
+    for one in (sim, other):
+        before = one.export_particle_x_to_torch()[3].clone()
+        for k in range(5):
+            one.p2g2p(k, DT)
+        assert torch.equal(one.export_particle_x_to_torch()[3], before)
+    torch.testing.assert_close(sim.state.x, other.state.x, rtol=0, atol=1e-12)
+    assert "yield_stress" in sim.state.extra
+    E = sim.mpm_model.E
+    sim.p2g2p(0, DT)
+    E *= 2
+    with pytest.raises(RuntimeError, match="E must not be written to while 1 substeps are pending"):
+        sim.export_particle_x_to_torch()
+
+
+@pytest.mark.parametrize(
+    ("dialect", "given", "message"),
+    [
+        ("physflow", {"mu_N": 1.0}, "mu_N must not require grad: it has no effect"),
+        ("motionphysics", {"viscosity": 1.0}, "viscosity must not require grad: it has no effect"),
+        ("gaussianfluent", {"flip_pic_ratio": 0.5}, "flip_pic_ratio must not require grad"),
+        ("pixie", {"material": "fluid", "bulk_modulus": 1e5, "E": 1e5}, "E must not require grad: it has no effect on"),
+    ],
+)
+def test_gradients_that_would_be_lost(dialect, given, message):
+    sim, _ = pair(COMMON | {"E": 0.1}, dialect=dialect)
+    name = next(iter(given)) if "E" not in given else "E"
+    given = given | {name: torch.tensor(given[name], requires_grad=True)}
+    with pytest.raises(ValueError, match=message):
+        sim.set_parameters_dict(given)
+        sim.finalize_mu_lam()
+
+
 @pytest.mark.parametrize("name", ["E", "mu"])
 def test_gradients_of_the_model(name, device):
     """`.grad` of a tensor of the model, against a difference; numbers become tensors that may require grad."""

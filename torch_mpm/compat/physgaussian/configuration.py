@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ...errors import check_number
 from ...files import read_text
+from ..gradients import refuse_grad
 from ..keys import check_keys, check_needed, checked_list
 from .dialects import DIALECTS, PHYSGAUSSIAN, Dialect, dialect_of, recognised
 from .parameters import check_box
@@ -226,6 +227,7 @@ def substep_of(time_params: Mapping[str, Any]) -> float:
 
 def _freeze(mpm_solver: MPM_Simulator_WARP, points: Tensor) -> None:
     """Hold the nodes of the cells of some points at rest."""
+    refuse_grad("it selects nodes", freeze_pts=points)
     n = int(mpm_solver.mpm_model.n_grid)
     x = mpm_solver.state.x
     i, j, k = (points.detach().to(x) * mpm_solver.mpm_model.inv_dx).long().clamp(0, n - 1).unbind(1)

@@ -117,7 +117,7 @@ _ALL = [
             configuration=("fix_ground", "spawn_offset")),
     Dialect("gaussianfluent", "GaussianFluent", keys=("alpha_0", "beta", "flip_pic_ratio"),
             materials={**BASE_MATERIALS, "watermelon": "watermelon"}, codes={**CODES, "watermelon": 7},
-            defaults={"friction_angle": 45.0}),
+            defaults={"friction_angle": 45.0, "alpha_0": -0.04}),
     Dialect("zeshunzong", "warp-mpm", keys=("bulk_modulus",), materials={**BASE_MATERIALS, "fluid": "fluid"},
             codes={**CODES, "fluid": 6}),
     Dialect("kywind", "kywind's warp-mpm", keys=("dx",), without_effect=("rpic_damping",), stress_form="mls",

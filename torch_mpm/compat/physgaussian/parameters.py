@@ -82,7 +82,7 @@ def checked(name: str, value: Any, like: Tensor) -> Any:
         if isinstance(value, (int, float)):
             raise TypeError(f"g must be three numbers, got {value}")
         return vector("g", value, like)
-    if name in ("n_grid", "grid_lim", "hardening"):
+    if name in ("n_grid", "grid_lim", "hardening", "flip_pic_ratio"):
         refuse_grad("it is a number of the whole simulation", **{name: value})
     if name == "n_grid":
         return check_count("n_grid", value, 1)

@@ -13,12 +13,13 @@ from ...errors import check_count, check_flag, check_like, shape_of
 from ...laws import Material
 from ...state.state import State, identity_deformation
 from ..clipping import ClippedRollout
-from ..gradients import Numbers, check_fixed, vector
+from ..gradients import Numbers, check_fixed, refuse_grad, vector
 from ..keys import check_needed, checked_list
 from ..node_conditions import NodeDamping
 from ..selections import in_box
 from .dialects import (
     PHYSGAUSSIAN,
+    WITHOUT_EFFECT,
     Dialect,
     check_parameter_keys,
     code_of,
@@ -101,7 +102,7 @@ class MPM_Simulator_WARP(Viewed):
         self._exports: dict[str, Any] = {}
         self._damping: NodeDamping | None = None
         self._clear_conditions()
-        self._pending = Pending()
+        self._pending, self._versions = Pending(), {}
 
     # ---- data
 
@@ -175,7 +176,8 @@ class MPM_Simulator_WARP(Viewed):
         extra = checked_list("additional_material_params", given.pop("additional_material_params", []))
         self._recognise(given, extra, getattr(kwargs, "dialect", None))
         check_parameter_keys(self.dialect, given)
-        given = {name: value for name, value in given.items() if name not in self.dialect.without_effect}
+        unused = {name: given.pop(name) for name in (*self.dialect.without_effect, *WITHOUT_EFFECT) if name in given}
+        refuse_grad("it has no effect", **unused)
         offset = given.pop("spawn_offset", None)
         values = {name: checked(name, value, state.x) for name, value in given.items()}
         for name, value in values.items():

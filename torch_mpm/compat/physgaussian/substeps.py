@@ -9,10 +9,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from ...cuda_graphs.capture import version
 from ...errors import check_number
 from ...grid.grid import Grid
 from ...laws import Material
 from ...state.state import State
+from ...step.particle_operations import Timed
 from ...step.step import Step
 from ..clipping import ClippedRollout
 from ..node_conditions import NodeDamping
@@ -46,6 +48,8 @@ class Substeps(DescendantMethods):
     _law: Material | None
     _step: ClippedRollout | None
     _damping: NodeDamping | None
+    _affine: list[Timed]
+    _enabled: tuple[int | None, list[Timed]]
     _selections: dict[str, Tensor]
     _pending: Pending
 
@@ -81,7 +85,7 @@ class Substeps(DescendantMethods):
         if self._pending[1:] != wanted[1:]:
             self._flush()
             self._check_ready()
-            self._pending = wanted
+            self._pending, self._versions = wanted, self._tensor_versions()
         else:
             self._pending = self._pending._replace(steps=self._pending.steps + 1)
 
@@ -115,8 +119,10 @@ class Substeps(DescendantMethods):
             raise ValueError("the material is not known: call set_parameters_dict and finalize_mu_lam before p2g2p")
         if "density" not in self.parameters and not bool((state.mass > 0).all()):
             raise ValueError("the particles have no mass: give density in set_parameters_dict")
-        if self._law is None:
+        if self._law is None or self._codes_have_changed():
             self._law = chosen_law(self.dialect, self.parameters | (self._moduli or {}), self._codes)
+            self._law_codes = self._codes, None if self._codes is None else version(self._codes)
+            self._state = state = state.replace(material=None)
             held = [kind == "stationary" for _, kind in kinds]
             self._anchored = self._anchor(state, held) if any(held) else None
             self._step = None
@@ -127,6 +133,19 @@ class Substeps(DescendantMethods):
             self._state = self._loaded().replace(material=law_indices(self._codes))
 
     _anchored: Anchored | None = None
+    _law_codes: tuple[Tensor | None, int | None] = (None, None)
+    _versions: dict[str, int | None]
+
+    def _tensor_versions(self) -> dict[str, int | None]:
+        """Versions of the tensors that substeps read, which grow with each write in place."""
+        tensors = {**self.parameters, **{f"mpm_state.{name}": t for name, t in self._selections.items()}}
+        tensors["mpm_state.particle_material"] = self._codes
+        return {name: version(t) for name, t in tensors.items() if isinstance(t, Tensor)}
+
+    def _codes_have_changed(self) -> bool:
+        """Whether materials of particles were written to in place since the law was chosen."""
+        codes, before = self._law_codes
+        return self._codes is not None and (codes is not self._codes or before != version(self._codes))
 
     def _anchor(self, state: State, held: list[bool]) -> Anchored:
         """Operation that keeps the particles of stationary materials where they are."""
@@ -151,6 +170,13 @@ class Substeps(DescendantMethods):
         (steps, dt, grad, flip), self._pending = self._pending, Pending()
         if steps == 0:
             return
+        now = self._tensor_versions()
+        for name, before in self._versions.items():
+            if now.get(name) != before:
+                raise RuntimeError(
+                    f"{name} must not be written to while {steps} substeps are pending, which would be computed with "
+                    "the new values: read a result, or assign a new tensor"
+                )
         began = time.perf_counter()
         with torch.set_grad_enabled(grad):
             self._check_ready()
@@ -212,9 +238,12 @@ class Substeps(DescendantMethods):
             assert self._law is not None
             grid, form = self._grid(), self.dialect.stress_form
             self._step = ClippedRollout(self._law, self.parameters.get("g"), grid, self._bounds, form)
-            affine = affine_operations(self.parameters.get("rpic_damping", 0.0))
-            self._lasting = affine, enabled_operations(self._selections.get("particle_selection"))
-        affine, enabled = self._lasting
+            self._affine = affine_operations(self.parameters.get("rpic_damping", 0.0))
+            self._enabled = -1, []
+        selection = self._selections.get("particle_selection")
+        if selection is not None and version(selection) != self._enabled[0]:
+            self._enabled = version(selection), enabled_operations(selection)
+        affine, enabled = self._affine, self._enabled[1]
         nodes = [b for b in self._boundaries(self._nodes) if acts(b, first, last, dt)]
         nodes = nodes if self._damping is None else [self._damping, *nodes]
         anchored = [] if self._anchored is None else [self._anchored]

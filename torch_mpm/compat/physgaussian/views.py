@@ -91,7 +91,8 @@ class ParticleView(_View):
         if name == "particle_init_cov":
             return one.initial_covariance().reshape(-1)
         if name == "particle_Jp":
-            return state.extra.get("log_plastic_volume", torch.zeros_like(state.mass))
+            start = one.parameter("alpha_0") if "alpha_0" in one.dialect.keys else 0.0
+            return state.extra.get("log_plastic_volume", torch.zeros_like(state.mass) + start)
         if name == "particle_material":
             return one.material_codes()
         if name in ("particle_selection", "object_selection"):
@@ -128,7 +129,8 @@ class ModelView(_View):
 
     Parameters are in the units of the dialect: E, nu, yield_stress and others of the dialect [P], of which those in
     `NUMBERS` are numbers unless tensors were given. mu, lam and bulk [P] [Pa] are those of the last `finalize_mu_lam`;
-    an assigned one acts from then on, E and nu from the next `finalize_mu_lam`.
+    an assigned one acts from then on, E and nu from the next `finalize_mu_lam`. Tensors may be written to in place, but
+    for mu, lam, bulk, and a yield stress that has flowed in units that are not Pa, which have to be assigned.
     """
 
     NUMBERS = (
@@ -209,7 +211,8 @@ class Viewed(Substeps):
         """
         state = self.state
         if name == "yield_stress" and name in state.extra:
-            return state.extra[name] / self.dialect.effective(name, 1.0)
+            unit = self.dialect.effective(name, 1.0)
+            return state.extra[name] if unit == 1 else state.extra[name] / unit
         value = self.parameters.get(name, 0.0)
         if not isinstance(value, Tensor):
             value = torch.full_like(state.mass, float(value))

@@ -17,6 +17,7 @@ from ...grid.grid import Grid
 from ...rollouts import rollout
 from ...state.state import State, identity_deformation
 from ...step.step import Step
+from ..gradients import refuse_grad
 from ..node_conditions import outer_planes, surface_margin
 from ..physgaussian.particles import Anchored
 from . import materials
@@ -276,6 +277,7 @@ class MPMSolver:
         emmiter_id: int = 0,
     ) -> None:
         """Particles at positions [P, D] [m], an array or a tensor, all with a velocity [m/s]; also between steps."""
+        refuse_grad("steps have no gradients here; see torch_mpm.rollout", particles=particles, velocity=velocity)
         x = torch.as_tensor(particles, dtype=torch.float32, device=self.device)
         if x.dim() != 2 or x.shape[1] != self.dim:
             raise ValueError(f"particles must have shape [P, {self.dim}], got {shape_of(x)}")
@@ -285,6 +287,7 @@ class MPMSolver:
 
     def read_restart(self, num_particles: int, pos: Any, vel: Any, material: Any, color: Any) -> None:
         """Particles with positions and velocities [P, D], materials and colors [P], undeformed."""
+        refuse_grad("steps have no gradients here; see torch_mpm.rollout", pos=pos, vel=vel)
         x, v = (torch.as_tensor(a[:num_particles], dtype=torch.float32, device=self.device) for a in (pos, vel))
         ids = (torch.as_tensor(np.asarray(a[:num_particles]).astype(np.int64)) for a in (material, color))
         kinds, colors = (i.to(self.device, torch.int32) for i in ids)

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ...cuda_graphs.capture import version
 from ...errors import check_count, check_like, check_number, shape_of
 from ..keys import nearest
 from ..physgaussian.stretches import engineering, lame
@@ -294,7 +295,7 @@ class MPMModelStruct(_Struct):
         """A value that changes with any assignment to the model, or write to a tensor of it."""
         self.settle()
         tensors = [value for value in self._values.values() if isinstance(value, Tensor)]
-        return self.version, *(t._version for t in tensors)
+        return self.version, *(version(t) for t in tensors)
 
     def requires_grad(self) -> bool:
         """Whether a tensor of the model requires grad."""

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ...cuda_graphs.capture import version
 from ...errors import check_count, check_flag, check_number
 from ...grid.grid import Grid
 from ...state.state import State
@@ -244,7 +245,7 @@ class MPMWARPDiff(ParticleConditions):
 
     def _roll_of(self, model: MPMModelStruct, selection: Tensor) -> tuple[ClippedRollout, list[Any]]:
         """Rollout of the model, and operations that always act; created again where the model has changed."""
-        key = model, selection, (model.marks(), selection._version, torch.is_grad_enabled())
+        key = model, selection, (model.marks(), version(selection), torch.is_grad_enabled())
         if self._made is not None and not model.requires_grad():
             before, roll, operations = self._made
             if before[0] is model and before[1] is selection and before[2] == key[2]:
