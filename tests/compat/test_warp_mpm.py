@@ -33,9 +33,9 @@ def made(parameters=None, device="cpu", moduli=(E, NU)):
     """Solver, model and state of a sheared cube."""
     x, volume = (torch.tensor(a, device=device) for a in blob())
     state, model = MPMStateStruct(), MPMModelStruct()
-    state.init(len(x), device=device, requires_grad=False)
+    state.init(len(x), device=device, requires_grad=True)
     state.from_torch(x, volume, None, torch.tensor(shear(blob()[0]), device=device), n_grid=N, grid_lim=LIM)
-    model.init(len(x), device=device, requires_grad=False)
+    model.init(len(x), device=device, requires_grad=True)
     model.init_other_params(n_grid=N, grid_lim=LIM, device=device)
     solver = MPMWARPDiff(len(x), n_grid=N, grid_lim=LIM, device=device)
     given = {"material": "jelly", "g": [0.0, 0.0, -9.8], "density": RHO}
@@ -77,23 +77,23 @@ def test_trajectories_of_the_materials(material, device):
     parameters = {"material": material, "grid_v_damping_scale": 0.999, "rpic_damping": 0.1} | MATERIALS[material]
     own = restated(parameters)
     own.on_nodes += [floor(0.33), bounding_box]
-    for _ in range(25):
+    for _ in range(15):
         own.p2g2p(DT)
     for in_place in (False, True):
         solver, model, state = made(parameters, device)
         solver.add_surface_collider((0.5, 0.5, 0.33), (0.0, 0.0, 2.0))
         solver.add_bounding_box()
         if in_place:
-            for k in range(25):
+            for k in range(15):
                 solver.p2g2p(model, state, k, DT)
-            assert solver.time == pytest.approx(25 * DT)
+            assert solver.time == pytest.approx(15 * DT)
         else:
-            state = stepped(solver, model, state, 25)
+            state = stepped(solver, model, state, 15)
         assert np.abs(state.particle_x.cpu().numpy() - own.x).max() < 1e-9
         np.testing.assert_allclose(state.particle_F_trial.cpu().numpy(), own.F, atol=1e-7)
         if material == "metal":
             np.testing.assert_allclose(state.history["yield_stress"].cpu().numpy(), own.limit, rtol=1e-6)
-    assert np.abs(own.x - blob()[0]).max() > 5e-3
+    assert np.abs(own.x - blob()[0]).max() > 2e-3
 
 
 def test_conditions_on_particles_and_nodes(device):

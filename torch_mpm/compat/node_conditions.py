@@ -109,7 +109,7 @@ class NodeMask(nn.Module):
         if tuple(mask.shape) != tuple(cells):
             raise ValueError(f"selection_mask must have the shape of the grid, {list(cells)}, got {list(mask.shape)}")
         self.register_buffer("mask", mask)
-        self.dx = dx
+        self.dx, self.cells = dx, tuple(cells)
 
     @staticmethod
     def checked(mask: Any) -> Tensor:
@@ -125,11 +125,12 @@ class NodeMask(nn.Module):
         return mask >= 1 if mask.dtype != torch.bool else mask.clone()
 
     def forward(self, velocity: Tensor, positions: Tensor, scene: Tensor | None, time: float, dt: float) -> Tensor:
-        index = (positions / self.dx).round().long()
-        sizes = torch.tensor(self.mask.shape, device=index.device)
-        inside = ((index >= 0) & (index < sizes)).all(1)
-        i, j, k = torch.where(inside[:, None], index, 0).unbind(1)
-        held = self.mask.to(index.device)[i, j, k] & inside
+        axes = (positions / self.dx).round().long().unbind(1)
+        inside, clamped = torch.ones_like(axes[0], dtype=torch.bool), []
+        for index, n in zip(axes, self.cells, strict=True):
+            inside = inside & (index >= 0) & (index < n)
+            clamped.append(index.clamp(0, n - 1))
+        held = self.mask[clamped[0], clamped[1], clamped[2]] & inside
         return torch.where(held[:, None], 0, velocity)
 
 
@@ -141,29 +142,33 @@ class StrictRegion(TensorModule):
     Args:
         inside: function of nodes − point [N, 3], float32, bool [N].
         point: [m]; it moves with the velocity from `start` on.
-        velocity: three numbers, or a tensor [3] [m/s].
+        velocity: tensor [3] [m/s] on the device of the particles.
         dx: node distance [m].
         start, end: it acts while start ≤ time < end [s].
     """
 
     def __init__(
-        self, inside: Callable[[Tensor], Tensor], point: Numbers, velocity: Numbers, dx: float, start: float, end: float
+        self, inside: Callable[[Tensor], Tensor], point: Numbers, velocity: Tensor, dx: float, start: float, end: float
     ) -> None:
         super().__init__()
-        self.inside, self.point, self.velocity = inside, [float(p) for p in point], velocity
-        self.dx, self.start, self.end = dx, float(start), float(end)
+        self.inside, self.velocity, self.dx, self.start, self.end = inside, velocity, dx, float(start), float(end)
+        like = {"dtype": torch.float32, "device": velocity.device}
+        self.point = torch.tensor([float(p) for p in point], **like)  # type: ignore[arg-type]
+        self.spacing = torch.tensor(dx, **like)  # type: ignore[arg-type]
 
-    def forward(self, velocity: Tensor, positions: Tensor, scene: Tensor | None, time: float, dt: float) -> Tensor:
-        dx, start = (torch.tensor(v, dtype=torch.float32, device=positions.device) for v in (self.dx, self.point))
-        nodes = (positions.detach() / self.dx).round().float() * dx
-        given = torch.as_tensor(self.velocity, dtype=velocity.dtype, device=velocity.device)
-        point = start + max(time - self.start, 0.0) * given.detach().float()
-        acting = self.inside(nodes - point) & (self.start <= time < self.end)
+    def forward(
+        self, velocity: Tensor, positions: Tensor, scene: Tensor | None, time: float | Tensor, dt: float
+    ) -> Tensor:
+        nodes = (positions.detach() / self.dx).round().float() * self.spacing
+        given, elapsed = self.velocity.to(velocity.dtype), time - self.start
+        elapsed = elapsed.clamp(min=0) if isinstance(elapsed, Tensor) else max(elapsed, 0.0)
+        point = self.point + elapsed * given.detach().float()
+        acting = self.inside(nodes - point) & (time >= self.start) & (time < self.end)
         return torch.where(acting[:, None], given, velocity)
 
 
-def strict_plane(point: Numbers, normal: Numbers, dx: float, start: float, end: float) -> StrictRegion:
-    """As `stopping_plane`, compared in float32."""
+def strict_plane(point: Numbers, normal: Numbers, dx: float, start: float, end: float, like: Tensor) -> StrictRegion:
+    """As `stopping_plane`, compared in float32, on the device of a tensor."""
     size = math.sqrt(sum(float(n) ** 2 for n in normal))
     direction = [float(n) / size for n in normal]
 
@@ -171,13 +176,11 @@ def strict_plane(point: Numbers, normal: Numbers, dx: float, start: float, end: 
         x, y, z = offset.unbind(1)
         return x * direction[0] + y * direction[1] + z * direction[2] < 0
 
-    return StrictRegion(behind, point, (0.0, 0.0, 0.0), dx, start, end)
+    return StrictRegion(behind, point, like.new_zeros(3), dx, start, end)
 
 
-def strict_cuboid(
-    point: Numbers, half: Numbers, velocity: Numbers, dx: float, start: float, end: float
-) -> StrictRegion:
-    """As `moving_cuboid`, compared in float32."""
+def strict_cuboid(point: Numbers, half: Numbers, velocity: Tensor, dx: float, start: float, end: float) -> StrictRegion:
+    """As `moving_cuboid`, compared in float32, on the device of the velocity [3]."""
     sizes = [float(h) for h in half]
 
     def within(offset: Tensor) -> Tensor:

@@ -100,7 +100,7 @@ class ConditionList:
             if surface == "cut":
                 return [Cut(point, normal, nodes.margin, start_time, end_time)]
             if nodes.strict:
-                return [strict_plane(point, normal, nodes.dx, start_time, end_time)]
+                return [strict_plane(point, normal, nodes.dx, start_time, end_time, nodes.like)]
             return [stopping_plane(point, normal, nodes.margin, start_time, end_time)]
 
         self._on_grid(create)
@@ -124,7 +124,7 @@ class ConditionList:
         def create(nodes: Nodes) -> list[Any]:
             moving = vector("velocity", velocity, nodes.like)
             if nodes.strict:
-                box: Any = strict_cuboid(point, size, moving, nodes.dx, start_time, end_time)
+                box: Any = strict_cuboid(point, size, _as_tensor(moving, nodes.like), nodes.dx, start_time, end_time)
             else:
                 box = moving_cuboid(point, size, moving, nodes.margin, start_time, end_time)
             return [box, FreezeOutside(start_time, end_time, RESET_STEPS)] if reset == 1 else [box]
@@ -146,7 +146,7 @@ class ConditionList:
             TypeError, ValueError: for another shape or dtype.
         """
         mask = NodeMask.checked(selection_mask)
-        self._on_grid(lambda nodes: [NodeMask(mask, nodes.dx, nodes.cells)])
+        self._on_grid(lambda nodes: [NodeMask(mask.to(nodes.like.device), nodes.dx, nodes.cells)])
 
     def add_boundary(self, boundary: Any) -> None:
         """Append an object with the interface of `torch_mpm.boundaries`."""
@@ -173,7 +173,8 @@ class ConditionList:
 
     def _acceleration(self, x: Tensor, force: Numbers, mask: Tensor, start_time: float, end_time: float) -> None:
         check_fixed("it selects particles", start_time=start_time, end_time=end_time)
-        self._push(Acceleration(vector("force", force, x), start_time, end_time, chosen("particle_mask", mask, x)))
+        given = _as_tensor(vector("force", force, x), x)
+        self._push(Acceleration(given, start_time, end_time, chosen("particle_mask", mask, x)))
 
     def _translation(
         self, x: Tensor, point: Numbers, size: Numbers, velocity: Numbers, start_time: float, end_time: float
@@ -225,6 +226,11 @@ class ConditionList:
     def _hold(self, operation: Any) -> None:
         self._before_change()
         self._holds.append(operation)
+
+
+def _as_tensor(value: Any, like: Tensor) -> Tensor:
+    """Numbers as a tensor in the dtype and on the device of another one."""
+    return torch.as_tensor(value, dtype=like.dtype, device=like.device)
 
 
 def acts(condition: Any, first: float, last: float, dt: float) -> bool:

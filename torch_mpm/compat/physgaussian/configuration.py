@@ -106,6 +106,15 @@ class MaterialParameters(dict[str, Any]):
 
     dialect: Dialect | None = None
 
+    def copy(self) -> MaterialParameters:
+        """A copy with the dialect."""
+        return self | {}
+
+    def __or__(self, other: Any) -> MaterialParameters:  # type: ignore[override]
+        result = MaterialParameters({**self, **other})
+        result.dialect = self.dialect
+        return result
+
 
 def decode_param_json(json_file: str | Path, dialect: str | None = None) -> tuple[Any, ...]:
     """Parts of a configuration with their defaults.

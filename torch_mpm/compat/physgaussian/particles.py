@@ -37,11 +37,11 @@ class Acceleration(Timed):
     """v ← v + dt a of some particles.
 
     Args:
-        acceleration: [m/s²], three numbers or a tensor [3] that may require grad.
+        acceleration: [m/s²], a tensor [3] that may require grad.
         start, end, particles: see `Timed`.
     """
 
-    def __init__(self, acceleration: Numbers, start: float, end: float, particles: Tensor) -> None:
+    def __init__(self, acceleration: Tensor, start: float, end: float, particles: Tensor) -> None:
         super().__init__(start, end, particles)
         self.acceleration = acceleration
 
@@ -49,7 +49,7 @@ class Acceleration(Timed):
         acting = self.acting(state)
         if acting is False:
             return state
-        change = dt * torch.as_tensor(self.acceleration, dtype=state.v.dtype, device=state.v.device)
+        change = dt * self.acceleration.to(state.v)
         return state.replace(v=torch.where(acting[:, None], state.v + change, state.v))  # type: ignore[index]
 
 

@@ -49,7 +49,7 @@ class ViscousJelly(StretchPlasticity):
         relaxed, stress = isotropic(trial, lambda sigma: self._branch(sigma, state))
         turned = stress @ polar(trial).R
         _, elastic = self.elastic.update(state)
-        return {"viscous_map": torch.linalg.solve(F, relaxed) - eye}, elastic + (turned + turned.mT) / 2
+        return {"viscous_map": torch.linalg.solve_ex(F, relaxed)[0] - eye}, elastic + (turned + turned.mT) / 2
 
     def _branch(self, sigma: Tensor, state: State) -> tuple[Tensor, Tensor]:
         """Stretches of F_N after relaxation, and principal stresses."""

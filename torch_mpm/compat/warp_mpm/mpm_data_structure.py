@@ -102,7 +102,7 @@ class MPMStateStruct(_Struct):
         return super().__getattr__("particle_F_trial" if name == "particle_F" else name)
 
     def init(self, shape: int, device: Any = None, requires_grad: bool = False) -> None:
-        """P particles with zeros in all arrays."""
+        """P particles with zeros in all arrays, which do not require grad; see `set_require_grad`."""
         P = check_count("shape", shape if not isinstance(shape, (tuple, list)) else shape[0])
         zeros = torch.zeros(P, device=device)
         self.particle_x, self.particle_v = zeros.new_zeros(P, 3), zeros.new_zeros(P, 3)
@@ -111,8 +111,6 @@ class MPMStateStruct(_Struct):
         self.particle_vol, self.particle_mass, self.particle_density = zeros, zeros.clone(), zeros.clone()
         self.particle_selection = torch.zeros(P, dtype=torch.int32, device=device)
         self.history = {}
-        if requires_grad:
-            self.set_require_grad(True)
 
     def init_grid(self, grid_res: int, device: Any = None, requires_grad: bool = False) -> None:
         """Store the number of cells; nodes have no arrays."""
@@ -255,10 +253,10 @@ class MPMModelStruct(_Struct):
     )
 
     def init(self, shape: int, device: Any = None, requires_grad: bool = False) -> None:
-        """Arrays of zeros for P particles."""
+        """Arrays of zeros for P particles, which do not require grad; see `set_require_grad`."""
         P = check_count("shape", shape if not isinstance(shape, (tuple, list)) else shape[0])
         for name in ("E", "nu", "mu", "lam", "yield_stress"):
-            setattr(self, name, torch.zeros(P, device=device, requires_grad=requires_grad))
+            setattr(self, name, torch.zeros(P, device=device))
         self.n_particles, self.hardening, self.xi = P, 0.0, 0.0
 
     def init_other_params(self, n_grid: int = 100, grid_lim: float = 1.0, device: Any = None) -> None:
