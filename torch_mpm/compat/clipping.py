@@ -74,9 +74,7 @@ class ClippedRollout:
         self.whole = self._acting(grid)
         self._clip = None if bounds is None else Clipped(*bounds)
         self._narrow: ActingStep | None = None
-        dx = grid.dx
-        if bounds is not None and bounds[1] - bounds[0] >= 3 * dx:  # Reported are particles a cell outside a domain.
-            self._narrow = self._acting(Grid(dx, (bounds[0] + dx,) * 3, (bounds[1] - dx,) * 3, grid.scenes))
+        self._leaves = bounds is None or bounds[1] - bounds[0] < 3 * grid.dx
 
     def _acting(self, grid: Grid) -> ActingStep:
         return ActingStep(Step(grid, self._law, gravity=self._gravity, stress_form=self._stress_form))
@@ -89,15 +87,24 @@ class ClippedRollout:
         arguments = nodes, operations, transfer, flip
         if self._bounds is None or self._clip is None or n == 0:
             return rollout(self.whole.with_conditions(*arguments), state, n, dt, checkpoint)
-        if n > 1 and self._narrow is not None:
-            step = self._narrow.with_conditions(*arguments)
+        if n > 1 and not self._leaves:
+            step = self._within(self._bounds).with_conditions(*arguments)
             after = rollout(step, state, n, dt, checkpoint)
             with torch.no_grad():
                 left = bool(step.failures().failed.any())
             if not left:
                 return after.replace(x=after.x.clamp(*self._bounds))
-            self._narrow = None
+            self._leaves = True
         state = rollout(self.whole.with_conditions(*arguments), state, 1, dt)
-        step = self.whole.with_conditions(nodes, [self._clip, *operations], transfer, flip)
-        after = rollout(step, state, n - 1, dt, checkpoint)
-        return after.replace(x=after.x.clamp(*self._bounds))
+        if n > 1:
+            step = self.whole.with_conditions(nodes, [self._clip, *operations], transfer, flip)
+            state = rollout(step, state, n - 1, dt, checkpoint)
+        return state.replace(x=state.x.clamp(*self._bounds))
+
+    def _within(self, bounds: tuple[float, float]) -> ActingStep:
+        """The step on a grid that reports particles beyond the bounds: those more than a cell outside its domain."""
+        if self._narrow is None:
+            grid = self.whole.step.grid
+            low, high = bounds[0] + grid.dx, bounds[1] - grid.dx
+            self._narrow = self._acting(Grid(grid.dx, (low,) * 3, (high,) * 3, grid.scenes))
+        return self._narrow

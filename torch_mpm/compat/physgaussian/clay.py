@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ...geometry.vectors import norm
 from ...laws import isotropic
+from .distortion import principal_stress
 from .stretches import StretchPlasticity
 
 if TYPE_CHECKING:
@@ -50,10 +51,7 @@ class NonAssociativeCamClay(StretchPlasticity):
 
         def flow(sigma: Tensor) -> tuple[Tensor, Tensor, Tensor]:
             mapped, moved = self._mapped(sigma, mu, kappa, M, beta, limit)
-            J, square = mapped.prod(1, keepdim=True), mapped.square()
-            deviator = square - square.mean(1, keepdim=True)
-            tau = mu * J.pow(-2 / 3) * deviator + kappa / 2 * (J * J - 1)
-            return mapped, tau, log_J + (moved if self.hardens else 0 * moved)
+            return mapped, principal_stress(mapped, mu, kappa), log_J + (moved if self.hardens else 0 * moved)
 
         F, stress, log_J = isotropic(state.F, flow)
         return {"F": F, "log_plastic_volume": log_J[:, 0]}, stress
@@ -62,8 +60,9 @@ class NonAssociativeCamClay(StretchPlasticity):
         """Stretches after flow [P, 3], and the change of ln J_p [P, 1]."""
         J, square = sigma.prod(1, keepdim=True), sigma.square()
         mean = square.mean(1, keepdim=True)
-        s = mu * J.pow(-2 / 3) * (square - mean)
-        p = -kappa / 2 * (J * J - 1)
+        tau = principal_stress(sigma, mu, kappa)
+        p = -tau.mean(1, keepdim=True)
+        s = tau + p
         half = 1.5 * (1 + 2 * beta)
         bound = M * M * (p + beta * limit) * (p - limit)
         above, below = p > limit, p < -beta * limit

@@ -58,15 +58,20 @@ class StretchedNeoHookean(StretchPlasticity):
         mu, lam = self._moduli(state)
 
         def stress(sigma: Tensor) -> Tensor:
-            J, square = sigma.prod(1, keepdim=True), sigma.square()
-            deviator = square - square.mean(1, keepdim=True)
-            return (mu * J.pow(-2 / 3) * deviator + lam / 2 * (J * J - 1)) * sigma
+            return principal_stress(sigma, mu, lam) * sigma
 
         return {}, isotropic(state.F, stress)
 
     def invalid(self, state: State) -> Tensor:
         assert state.F is not None
         return ~(determinant(state.F) > 0)
+
+
+def principal_stress(sigma: Tensor, mu: Any, bulk: Any) -> Tensor:
+    """μ J^(−2/3) dev σ² + K/2 (J² − 1) of stretches σ [P, 3]."""
+    J, square = sigma.prod(1, keepdim=True), sigma.square()
+    deviator = square - square.mean(1, keepdim=True)
+    return mu * J.pow(-2 / 3) * deviator + bulk / 2 * (J * J - 1)
 
 
 def _distortion(F: Tensor, J: Tensor) -> Tensor:

@@ -11,10 +11,11 @@ from torch import Tensor
 
 from ...geometry.vectors import norm
 from ...laws import FixedCorotated, Material, QuarticSand, WeaklyCompressible, isotropic
+from ..constitutive import lame
 from .clay import NonAssociativeCamClay
 from .distortion import DistortionalFluid, StretchedNeoHookean
 from .parameters import hardens
-from .stretches import StretchPlasticity, lame, strain_deviator, stretched_hencky
+from .stretches import StretchPlasticity, strain_deviator, stretched_hencky
 from .viscous_branch import ViscousJelly
 
 if TYPE_CHECKING:

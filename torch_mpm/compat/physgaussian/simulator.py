@@ -13,6 +13,7 @@ from ...errors import check_count, check_flag, check_like, shape_of
 from ...laws import Material
 from ...state.state import State, identity_deformation
 from ..clipping import ClippedRollout
+from ..constitutive import lame
 from ..gradients import Numbers, check_fixed, refuse_grad, vector
 from ..keys import check_needed, checked_list
 from ..node_conditions import NodeDamping
@@ -30,7 +31,6 @@ from .dialects import (
 )
 from .law_choice import chosen_law
 from .parameters import BOX, check_box, checked
-from .stretches import lame
 from .substeps import Pending
 from .views import ModelView, ParticleView, Viewed
 

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ...laws import Material
 from ...laws.parameters import evaluate, store
+from ..constitutive import lame
 
 if TYPE_CHECKING:
     from ...state.state import State
@@ -47,16 +48,6 @@ class StretchPlasticity(Material):
     def invalid(self, state: State) -> Tensor:
         assert state.F is not None
         return ~state.F.isfinite().all((1, 2))
-
-
-def lame(E: Any, nu: Any) -> tuple[Any, Any]:
-    """μ and λ [Pa] of Young's modulus [Pa] and Poisson's ratio."""
-    return E / (2 * (1 + nu)), E * nu / ((1 + nu) * (1 - 2 * nu))
-
-
-def engineering(mu: Any, lam: Any) -> tuple[Any, Any]:
-    """Young's modulus [Pa] and Poisson's ratio of μ and λ [Pa]."""
-    return mu * (3 * lam + 2 * mu) / (lam + mu), lam / (2 * (lam + mu))
 
 
 def strain_deviator(sigma: Tensor) -> tuple[Tensor, Tensor, Tensor]:

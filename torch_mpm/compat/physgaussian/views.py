@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from ...errors import shape_of
+from ...ops.sand import friction_alpha
+from ..constitutive import engineering, lame
 from ..keys import nearest
 from ..selections import chosen
 from .dialects import code_of, material_of
-from .stretches import engineering, lame
 from .substeps import Substeps
 
 if TYPE_CHECKING:
@@ -164,8 +165,8 @@ class ModelView(_View):
         if name == "update_cov_with_F":
             return False
         if name == "alpha":
-            angle = torch.deg2rad(torch.as_tensor(one.parameter("friction_angle"), dtype=torch.float64))
-            return (2 / 3) ** 0.5 * 2 * angle.sin() / (3 - angle.sin())
+            angle = torch.as_tensor(one.parameter("friction_angle"), dtype=torch.float64)
+            return friction_alpha(torch.deg2rad(angle), 3)
         return one.per_particle(name) if name in self.ARRAYS_OF_PARAMETERS else one.parameter(name)
 
     def _write(self, name: str, value: Any) -> None:

@@ -10,6 +10,8 @@ from torch import Tensor
 
 from ...geometry.vectors import determinant
 from ...laws import FixedCorotated, Material, Mixture, QuarticSand, Snow
+from ...ops.sand import friction_alpha
+from ..constitutive import lame
 
 WATER, ELASTIC, SNOW, SAND, STATIONARY = range(5)
 NAMES = {"WATER": WATER, "ELASTIC": ELASTIC, "SNOW": SNOW, "SAND": SAND, "STATIONARY": STATIONARY}
@@ -36,7 +38,7 @@ def law_of(material: int, E: float, dim: int, plastic: bool = True) -> Material:
         raise ValueError(f"material must be one of {sorted(NAMES.values())}, got {material!r}")
     if material in (SNOW, SAND) and not plastic:
         raise ValueError("material snow and sand need support_plasticity=True")
-    mu, lam = E / (2 * (1 + POISSON)), E * POISSON / ((1 + POISSON) * (1 - 2 * POISSON))
+    mu, lam = lame(E, POISSON)
     if material == WATER:  # τ = λ J (J − 1) with J = det F; see `shapeless`.
         return FixedCorotated(mu=0.0, lam=lam)
     if material == SNOW:
@@ -49,8 +51,8 @@ def law_of(material: int, E: float, dim: int, plastic: bool = True) -> Material:
 
 def _plane_angle(angle: float) -> float:
     """Friction angle in 2-D with the slope that a friction angle has in 3-D, which taichi_elements uses in both."""
-    sine = math.sin(angle)
-    return math.asin(math.sqrt(2) * math.sqrt(2 / 3) * 2 * sine / (3 - sine))
+    slope = friction_alpha(torch.tensor(angle, dtype=torch.float64), 3)
+    return math.asin(math.sqrt(2) * float(slope))
 
 
 def mixture_of(materials: Sequence[int], E: float, dim: int, plastic: bool) -> Material:

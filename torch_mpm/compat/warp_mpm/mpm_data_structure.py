@@ -10,8 +10,8 @@ from torch import Tensor
 
 from ...cuda_graphs.capture import version
 from ...errors import check_count, check_like, check_number, shape_of
+from ..constitutive import engineering, lame
 from ..keys import nearest
-from ..physgaussian.stretches import engineering, lame
 from ..selections import chosen
 
 
