@@ -494,7 +494,7 @@ def recorded(monkeypatch):
     return found
 
 
-def test_conditions_cost_nothing_before_and_after(monkeypatch):
+def test_conditions_cost_nothing_before_and_after(monkeypatch, capsys):
     """An impulse of one step, held particles and a reset: the other steps are computed together, without them."""
     sim, _ = pair(COMMON | {"E": 1e5}, shear)
     sim.finalize_mu_lam()
@@ -508,6 +508,9 @@ def test_conditions_cost_nothing_before_and_after(monkeypatch):
     assert sum(n for n, _, operations in found if operations) <= 14 and len(found) <= 5
     assert max(n for n, _, operations in found if not operations) >= 39
     assert sim.step.explain(sim.state, DT).startswith("all steps in one op")
+    sim.print_time_profile()
+    title, line = capsys.readouterr().out.splitlines()
+    assert title == "MPM Time profile:" and float(line.split()[1]) > 0
 
 
 def test_pic_is_computed_together(monkeypatch, device):
