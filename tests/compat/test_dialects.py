@@ -1,6 +1,7 @@
 """Descendants of PhysGaussian's simulator: every call against the step restated in NumPy, or converted parameters."""
 
 import json
+from functools import partial
 
 import numpy as np
 import pytest
@@ -196,7 +197,7 @@ def test_the_clay_of_gaussianfluent():
 
 
 def test_flip_of_gaussianfluent(device):
-    """A blend of FLIP and PIC with the whole stress, and APIC without."""
+    """A blend of FLIP and PIC with forces times the weights, and APIC without."""
     material = {"material": "watermelon", "E": 1e5, "beta": 2.0, "hardening": 1, "xi": 3.0}
     sim, own = twins("gaussianfluent", material, {"E": 1e5}, device)
     sim.set_parameters_dict({"material": "jelly"})
@@ -205,8 +206,12 @@ def test_flip_of_gaussianfluent(device):
 
     def flip(dt):
         weights = Weights(own.x, DX, N)
-        m, mv = to_grid(weights, N, own.mass, own.v, 0 * own.F, own.volume, own.stress(dt), dt, False, DX)
-        old = to_grid(weights, N, own.mass, own.v, 0 * own.F, own.volume, 0 * own.F, dt, False, DX)[1]
+        stress = own.stress(dt)
+        old = to_grid(weights, N, own.mass, own.v, 0 * own.F, own.volume, 0 * own.F, dt, False, DX)
+        m, old = old
+        mv = old.copy()
+        for w, dw, _, node in weights:
+            np.add.at(mv, node, -dt * (own.volume * w)[:, None] * np.einsum("pij,pj->pi", stress, dw))
         inverse = np.where(m > 1e-15, 1 / np.maximum(m, 1e-300), 0)[:, None]
         v = np.where(m[:, None] > 1e-15, mv * inverse + dt * own.g, 0)
         for act in own.on_nodes:
@@ -215,10 +220,7 @@ def test_flip_of_gaussianfluent(device):
         own.v = share * own.v + new - share * from_grid(weights, old * inverse, DX)[0]
         own.x, own.F, own.time = own.x + dt * new, (EYE + dt * grad) @ own.F, own.time + dt
 
-    with pytest.warns(UserWarning, match="substeps blend FLIP and PIC with the whole force"):
-        sim.p2g2p(0, DT, flip_pic_ratio=share)
-    flip(DT)
-    for k in range(19):
+    for k in range(20):
         sim.p2g2p(k, DT, flip_pic_ratio=share, flip_pic=True)
         flip(DT)
     assert np.abs(sim.export_particle_x_to_torch().cpu().numpy() - own.x).max() < 1e-9
@@ -513,9 +515,12 @@ def test_conditions_cost_nothing_before_and_after(monkeypatch, capsys):
     assert title == "MPM Time profile:" and float(line.split()[1]) > 0
 
 
-def test_pic_is_computed_together(monkeypatch, device):
+@pytest.mark.parametrize("dialect", ["physgaussian", "gaussianfluent"])
+def test_pic_is_computed_together(dialect, monkeypatch, device):
     """Without C, except in the last step, whose C is that of single steps."""
-    sim, own = pair(COMMON | {"E": 1e5, "rpic_damping": -1.0}, shear, device)
+    sim, own = pair(COMMON | {"E": 1e5, "rpic_damping": -1.0}, shear, device, dialect=dialect)
+    if dialect == "gaussianfluent":
+        monkeypatch.setattr(sim, "p2g2p", partial(sim.p2g2p, flip_pic=False))
     sim.finalize_mu_lam()
     found = recorded(monkeypatch)
     assert np.abs(run(sim, own, 20) - own.x).max() < 1e-9

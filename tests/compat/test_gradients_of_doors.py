@@ -108,7 +108,6 @@ OF_DIALECTS = {
 }
 
 
-@pytest.mark.filterwarnings("ignore:substeps blend FLIP")
 @pytest.mark.parametrize(("dialect", "kind"), OF_DIALECTS)
 def test_parameters_of_dialects(dialect, kind, device):
     """By multiples of all parameters of a material."""

@@ -60,6 +60,7 @@ class ClippedRollout:
         grid: the lattice.
         bounds: of positions [m], multiples of dx; None without.
         stress_form: see `Step`.
+        make: class of the steps.
     """
 
     def __init__(
@@ -69,7 +70,9 @@ class ClippedRollout:
         grid: Grid,
         bounds: tuple[float, float] | None = None,
         stress_form: str = "gradient",
+        make: type[Step] = Step,
     ) -> None:
+        self._make = make
         self._law, self._gravity, self._bounds, self._stress_form = law, gravity, bounds, stress_form
         self.whole = self._acting(grid)
         self._clip = None if bounds is None else Clipped(*bounds)
@@ -77,7 +80,7 @@ class ClippedRollout:
         self._leaves = bounds is None or bounds[1] - bounds[0] < 3 * grid.dx
 
     def _acting(self, grid: Grid) -> ActingStep:
-        return ActingStep(Step(grid, self._law, gravity=self._gravity, stress_form=self._stress_form))
+        return ActingStep(self._make(grid, self._law, gravity=self._gravity, stress_form=self._stress_form))
 
     def run(
         self, state: State, n: int, dt: float, nodes: list[Any], operations: list[Any], transfer: str = "apic",

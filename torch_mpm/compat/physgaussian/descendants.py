@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -202,12 +201,3 @@ class DescendantMethods(ConditionList, Exchange):
             "set_velocity_by_index has no index: its kernel in GaussianFluent raises an error at the first substep. "
             "Call enforce_particle_velocity_translation, or set mpm_state.particle_selection"
         )
-
-
-def warn_of_flip() -> None:
-    """Report once that FLIP here has the whole stress."""
-    warnings.warn(
-        "substeps blend FLIP and PIC with the whole force of the stress; GaussianFluent multiplies it by the weight of "
-        "the node once more, so that its bodies are softer: lower E, or pass flip_pic=False for its APIC",
-        stacklevel=3,
-    )

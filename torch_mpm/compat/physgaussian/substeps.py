@@ -19,9 +19,10 @@ from ...step.step import Step
 from ..clipping import ClippedRollout
 from ..node_conditions import NodeDamping
 from .condition_list import Nodes, acts, changes
-from .descendants import DescendantMethods, warn_of_flip
+from .descendants import DescendantMethods
 from .law_choice import chosen_law, kinds_of, law_indices, needs_moduli
 from .particles import Anchored, affine_operations, enabled_operations
+from .weighted_force import WeightedForceStep
 
 DEFAULT_FLIP = 0.8
 """Share of FLIP of GaussianFluent."""
@@ -73,7 +74,7 @@ class Substeps(DescendantMethods):
         """A substep of dt [s]; `step` is not used.
 
         In the dialect of MotionPhysics the first argument is dt. In that of GaussianFluent the substep blends PIC with
-        a share `flip_pic_ratio` of FLIP, unless `flip_pic` is False.
+        a share `flip_pic_ratio` of FLIP, with its forces, unless `flip_pic` is False.
         """
         if self.dialect.name == "motionphysics" and not isinstance(dt, (int, float)):
             dt = step
@@ -96,13 +97,8 @@ class Substeps(DescendantMethods):
             return None
         if flip_pic is False:
             return None
-        if not self._warned_of_flip:
-            self._warned_of_flip = True
-            warn_of_flip()
         given = self.parameters.get("flip_pic_ratio", DEFAULT_FLIP) if ratio is None else ratio
         return float(check_number("flip_pic_ratio", float(given), "between 0 and 1", lambda v: 0 <= v <= 1))
-
-    _warned_of_flip = False
 
     def print_time_profile(self) -> None:
         """Print the time of the substeps so far [ms]; on CUDA that of their launch, except where results were read."""
@@ -191,7 +187,7 @@ class Substeps(DescendantMethods):
         """The substeps between two changes of conditions."""
         before, last = self._loaded(), first + (count - 1) * dt
         if flip is not None:
-            self._state = self._rolled(before, count, first, last, dt, flip).replace(C=before.C)
+            self._state = self._rolled(before, count, first, last, dt, flip, weighted=True).replace(C=before.C)
         elif self._is_pic and count > 1:  # PIC needs no C, which the last substep alone computes.
             state = self._rolled(before, count - 1, first, last, dt, 0.0).replace(C=before.C)
             self._state = self._rolled(state, 1, first, last, dt)
@@ -200,11 +196,24 @@ class Substeps(DescendantMethods):
         if self._anchored is not None:
             self._state = self._anchored(self._loaded(), dt)
 
-    def _rolled(self, state: State, n: int, first: float, last: float, dt: float, flip: float | None = None) -> State:
-        """State after n substeps."""
-        nodes, operations, transfer, share = self._active(first, last, dt, flip)
-        assert self._step is not None
-        return self._step.run(state, n, dt, nodes, operations, transfer, share)
+    def _rolled(
+        self, state: State, n: int, first: float, last: float, dt: float, flip: float | None = None,
+        weighted: bool = False,
+    ) -> State:  # fmt: skip
+        """State after n substeps; `weighted` with the forces of GaussianFluent's FLIP."""
+        active = self._active(first, last, dt, flip)
+        if weighted and self._flip_step is None:
+            self._flip_step = self._new_rollout(WeightedForceStep)
+        roll = self._flip_step if weighted else self._step
+        assert roll is not None
+        return roll.run(state, n, dt, *active)
+
+    def _new_rollout(self, make: type[Step] = Step) -> ClippedRollout:
+        assert self._law is not None
+        gravity, form = self.parameters.get("g"), self.dialect.stress_form
+        return ClippedRollout(self._law, gravity, self._grid(), self._bounds, form, make)
+
+    _flip_step: ClippedRollout | None = None
 
     @property
     def _is_pic(self) -> bool:
@@ -235,9 +244,7 @@ class Substeps(DescendantMethods):
             flip: share of FLIP over PIC; None for APIC.
         """
         if self._step is None:
-            assert self._law is not None
-            grid, form = self._grid(), self.dialect.stress_form
-            self._step = ClippedRollout(self._law, self.parameters.get("g"), grid, self._bounds, form)
+            self._step, self._flip_step = self._new_rollout(), None
             self._affine = affine_operations(self.parameters.get("rpic_damping", 0.0))
             self._enabled = -1, []
         selection = self._selections.get("particle_selection")
