@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 
 import pytest
+import torch
 from helpers import example
 
 ROOT = Path(__file__).parents[2]
@@ -28,10 +29,15 @@ def test_learned_law():
     assert last < 0.9 * first
 
 
-@pytest.mark.parametrize("page", ["physgaussian", "nclaw", "mpm_pytorch"])
+PAGES = ["physgaussian", "descendants", "warp_mpm", "taichi_elements", "nclaw", "mpm_pytorch"]
+
+
+@pytest.mark.parametrize("page", PAGES)
 def test_programs_of_the_migration_pages(page):
-    (program,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "migrating" / f"{page}.md").read_text(), re.DOTALL)
+    """The programs of a page, one after another."""
+    text = (ROOT / "docs" / "migrating" / f"{page}.md").read_text()
     names: dict = {"__name__": "__main__"}
-    exec(compile(program, page, "exec"), names)
-    position = names["position"] if page == "physgaussian" else names["x"]
+    for program in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
+        exec(compile(program, page, "exec"), names)
+    position = torch.as_tensor(names["position"] if "position" in names else names["x"])
     assert bool(position.isfinite().all()) and float(position.detach().mean()) != 0.5

@@ -62,16 +62,16 @@ def loss_of(x):
 # ---- PhysGaussian
 
 
-def simulated(device, parameters, act=lambda solver: None, steps=8):
+def simulated(device, parameters, act=lambda solver: None, steps=8, dialect=None):
     x = cube(device)
-    solver = MPM_Simulator_WARP(10)
+    solver = MPM_Simulator_WARP(10, dialect=dialect)
     solver.load_initial_data_from_torch(x, torch.full_like(x[:, 0], 1e-4), n_grid=N)
     solver.import_particle_v_from_torch(motion(x))
     solver.set_parameters_dict(COMMON | parameters)
     act(solver)
     solver.finalize_mu_lam()
     for k in range(steps):
-        solver.p2g2p(k, DT)
+        solver.p2g2p(*(() if dialect == "motionphysics" else (k,)), DT)
     return loss_of(solver.export_particle_x_to_torch())
 
 
@@ -86,6 +86,39 @@ def test_parameters_of_the_simulator(kind, name, device):
         return simulated(device, parameters | {name: value})
 
     compared(loss, (COMMON | parameters)[name], device)
+
+
+OF_DIALECTS = {
+    ("physics3d", "jelly"): {"E": 1e-2, "mu_N": 2e4, "lam_N": 3e4, "viscosity": 50.0},
+    ("dreamphysics", "jelly"): {"E": 1e-2},
+    ("physflow", "newtonian"): {"E": 1e-2},
+    ("physflow", "non_newtonian"): {"E": 1e-2, "yield_stress": 1e-2, "plastic_viscosity": 1e-3},
+    ("physflow", "plasticine"): {"E": 1e-2, "yield_stress": 1e-2, "softening": 5e2},
+    ("motionphysics", "newtonian"): {"mu": 4e-3, "bulk": 0.8},
+    ("motionphysics", "fluid"): {"bulk": 0.8},
+    ("pixie", "fluid"): {"bulk_modulus": 8e4},
+    ("gaussianfluent", "watermelon"): {
+        "beta": 0.5,
+        "alpha_0": -0.02,
+        "xi": 2.0,
+        "hardening": 1,
+        "friction_angle": 30.0,
+    },
+    ("warp_mpm", "neo-hookean"): {},
+}
+
+
+@pytest.mark.parametrize(("dialect", "kind"), OF_DIALECTS)
+def test_parameters_of_dialects(dialect, kind, device):
+    """By multiples of all parameters of a material."""
+    own = OF_DIALECTS[dialect, kind] or {"E": 1e5}
+    names = [name for name in own if name != "hardening"]
+
+    def loss(factors):
+        given = {name: own[name] * factor for name, factor in zip(names, factors.unbind(), strict=True)}
+        return simulated(device, {"material": kind} | own | given, dialect=dialect)
+
+    compared(loss, [1.0] * len(names), device)
 
 
 @pytest.mark.parametrize("name", ["yield_stress", "xi", "friction_angle", "plastic_viscosity", "softening"])
@@ -129,6 +162,29 @@ CALLS = {
     ),
 }
 """Arguments of each method, and those with a gradient."""
+HALF = [k % 2 for k in range(64)]
+CALLS |= {
+    "enforce_grid_velocity_by_mask": ({"selection_mask": torch.ones(N, N, N, dtype=torch.int32).tolist()}, ()),
+    "add_impulse_on_particles_with_mask": (
+        {"force": [30.0, 10.0, 20.0], "particle_mask": HALF, **TIMES, **WHERE},
+        ("force",),
+    ),
+    "add_constant_force": ({"force": [30.0, 10.0, 20.0], "point": [0.5] * 3, "radius": 0.1, **TIMES}, ("force",)),
+    "add_impulse_on_object": (
+        {"force": [0.3, 0.1, 0.2], "dt": DT, "num_dt": 3, "start_time": 0.0, **WHERE},
+        ("force",),
+    ),
+    "enforce_scene_velocity_translation": ({"velocity": [0.3, 0.1, 0.2], **TIMES}, ("velocity",)),
+    "release_particles_sequentially_size": (
+        {"normal": [1, 0, 0], "start_position": 0.6, "end_position": 0.4, "num_layers": 5, **WHERE, **TIMES},
+        (),
+    ),
+    "tear_object": (
+        {"force": [0.3, 0.1, 0.2], "dt": DT, "num_dt": 3, "bbox": [[0.3, 0.7]] * 3, "axis": 0, "start_time": 0.0},
+        ("force",),
+    ),
+}
+"""Those of descendants."""
 ARGUMENTS = [(method, name) for method, (arguments, _) in CALLS.items() for name in arguments]
 
 
@@ -136,8 +192,14 @@ ARGUMENTS = [(method, name) for method, (arguments, _) in CALLS.items() for name
 def test_arguments_of_conditions(method, name, device):
     arguments, differentiable = CALLS[method]
 
+    def act(solver, value):
+        if method == "enforce_scene_velocity_translation":
+            solver.mpm_state.object_selection = torch.tensor(HALF, device=device)
+        masks = {k: torch.tensor(v, device=device) for k, v in arguments.items() if k.endswith("_mask")}
+        getattr(solver, method)(**arguments | masks | {name: value})
+
     def loss(value):
-        return simulated(device, {}, lambda solver: getattr(solver, method)(**arguments | {name: value}))
+        return simulated(device, {}, lambda solver: act(solver, value))
 
     compared_or_refused(loss, name, arguments[name], name in differentiable, device)
 
@@ -377,7 +439,9 @@ def test_arrays_of_bodies_have_no_gradient():
 def test_physgaussian_names_every_method():
     """No method that takes arguments is missing here."""
     methods = [
-        n for n in dir(physgaussian.MPM_Simulator_WARP) if n.startswith(("add_", "set_", "enforce_", "release_"))
+        n
+        for n in dir(physgaussian.MPM_Simulator_WARP)
+        if n.startswith(("add_", "set_", "enforce_", "release_", "tear_"))
     ]
-    others = {"add_boundary", "set_parameters", "set_parameters_dict"}
-    assert set(methods) - others == set(CALLS)
+    others = {"add_boundary", "set_parameters", "set_parameters_dict", "set_E_nu", "set_E_nu_from_torch"}
+    assert set(methods) - others - {"set_velocity_by_index"} == set(CALLS)

@@ -9,7 +9,13 @@ import torch
 
 import torch_mpm as mpm
 from torch_mpm.compat import mpm_pytorch
-from torch_mpm.compat.physgaussian import MPM_Simulator_WARP, configuration, decode_param_json, set_boundary_conditions
+from torch_mpm.compat.physgaussian import (
+    MPM_Simulator_WARP,
+    configuration,
+    decode_param_json,
+    dialects,
+    set_boundary_conditions,
+)
 from torch_mpm.compat.physgaussian import parameters as table
 
 NEEDS = {
@@ -21,8 +27,8 @@ NEEDS = {
 }
 
 
-def solver(count=10):
-    result = MPM_Simulator_WARP(count)
+def solver(count=10, **options):
+    result = MPM_Simulator_WARP(count, **options)
     x = 0.4 + 0.2 * torch.rand(count, 3, generator=torch.Generator().manual_seed(0))
     result.load_initial_data_from_torch(x, torch.full((count,), 1e-5), n_grid=20)
     return result
@@ -35,7 +41,7 @@ def typos(word):
     return {swapped, word[:-1], word[:middle] + word[middle - 1 :]} - {word}
 
 
-@pytest.mark.parametrize("key", [k for k in table.KNOWN if len(k) > 3])
+@pytest.mark.parametrize("key", [k for k in dialects.BASE_KEYS if len(k) > 3])
 def test_typing_errors_name_the_nearest_key(key):
     for word in typos(key):
         with pytest.raises(ValueError, match=f"{word!r} is unknown, the nearest known key is '"):
@@ -44,24 +50,90 @@ def test_typing_errors_name_the_nearest_key(key):
         solver().set_parameters(**{key + "s": 1.0})
 
 
-@pytest.mark.parametrize("key", table.UNSUPPORTED)
-def test_keys_of_descendants(key, tmp_path):
-    with pytest.raises(ValueError, match=f"set_parameters_dict must have known keys: '{key}' is not supported: "):
-        solver().set_parameters_dict({"E": 1.0, key: 1.0})
+FOREIGN = sorted({key for d in dialects.DIALECTS.values() for key in d.known} - set(dialects.PHYSGAUSSIAN.known))
+
+
+@pytest.mark.parametrize("key", FOREIGN)
+def test_keys_of_another_dialect(key, tmp_path):
+    with pytest.raises(ValueError, match=f"must have known keys: '{key}' is not supported: .* has it: pass dialect="):
+        solver(dialect="physgaussian").set_parameters_dict({"E": 1.0, key: 1.0})
     with pytest.raises(ValueError, match=f"the configuration must have known keys: '{key}' is not supported"):
-        decode_param_json(written(tmp_path, {key: 1.0}))
+        decode_param_json(written(tmp_path, {key: 1.0}), "physgaussian")
+
+
+def test_dialects_with_batches():
+    for call in (lambda: solver(dialect="kywind"), lambda: solver().set_parameters_dict({"dx": 0.1})):
+        with pytest.raises(ValueError, match=r"dialect must not be 'kywind', .* need BatchedSimulator"):
+            call()
+
+
+@pytest.mark.parametrize("dialect", [name for name in dialects.DIALECTS if name != "kywind"])
+def test_typing_errors_in_a_dialect(dialect):
+    for key in dialects.DIALECTS[dialect].keys:
+        with pytest.raises(ValueError, match=f"'{key}s' is unknown, the nearest known key is '{key}'"):
+            solver(dialect=dialect).set_parameters_dict({key + "s": 1.0})
+
+
+RECOGNISED = [
+    ({"mu": 1e-3, "bulk": 1.0}, "motionphysics"),
+    ({"alpha_0": -0.04}, "gaussianfluent"),
+    ({"material": "watermelon"}, "gaussianfluent"),
+    ({"bulk_modulus": 1e5}, "pixie"),
+    ({"bulk_modulus": 1e5, "material": "fluid"}, "pixie"),
+    ({"spawn_offset": [0, 0, 0]}, "pixie"),
+    ({"mu_N": 1.0, "material": "sand"}, None),
+    ({"mu_N": 1.0, "material": "non_newtonian"}, "physflow"),
+    ({"viscosity": 1.0}, None),
+    ({"material": "fluid"}, None),
+    ({"material": "neo-hookean"}, "warp_mpm"),
+]
+
+
+@pytest.mark.parametrize(("given", "dialect"), RECOGNISED)
+def test_dialects_are_recognised_and_reported(given, dialect):
+    one = solver()
+    if dialect is None:
+        with pytest.raises(ValueError, match=r"dialect must be given: .* which have different units or laws"):
+            one.set_parameters_dict(given)
+        return
+    project = dialects.DIALECTS[dialect].project
+    with pytest.warns(UserWarning, match=f"parameters are those of {project}.*recognised by .*dialect='{dialect}'"):
+        one.set_parameters_dict(given)
+    assert one.dialect.name == dialect
+
+
+def test_units_do_not_change_afterwards():
+    one = solver()
+    one.set_parameters_dict({"E": 1e5})
+    with pytest.raises(ValueError, match="dialect must be given: E had been given in SI units"):
+        one.set_parameters_dict({"mu": 1.0, "bulk": 1.0})
+    with pytest.raises(ValueError, match=r"dialect must be one of .*'physgaussian'.*, got 'physgausian'"):
+        solver(dialect="physgausian")
+
+
+def test_a_chosen_dialect_is_reported_once(caplog, monkeypatch):
+    monkeypatch.setattr(dialects, "_REPORTED", set())
+    for _ in range(2):
+        solver(dialect="motionphysics")
+    (entry,) = caplog.messages
+    assert entry.startswith("parameters are those of MotionPhysics: E in 1e7 Pa, yield_stress in 1e5 Pa, plastic_visc")
+
+
+def test_a_modulus_in_other_units_is_noticed():
+    with pytest.warns(UserWarning, match="E = 0.05 Pa is softer than any solid: .*dialect="):
+        solver().set_parameters_dict({"E": 0.05})
 
 
 def test_all_problems_are_named_at_once():
     with pytest.raises(ValueError, match=r"'mu_N' is not supported.*'yeild_stress' is unknown.*'yield_stress'"):
-        solver().set_parameters_dict({"mu_N": 1, "E": 1.0, "yeild_stress": 1})
+        solver(dialect="physgaussian").set_parameters_dict({"mu_N": 1, "E": 1.0, "yeild_stress": 1})
 
 
 def test_keys_without_effect_are_accepted():
     """PhysGaussian itself writes these keys into its parameters."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        solver().set_parameters_dict(dict.fromkeys(table.WITHOUT_EFFECT, 0.5))
+        solver().set_parameters_dict(dict.fromkeys(dialects.WITHOUT_EFFECT, 0.5))
 
 
 BOX = {"point": [0.5] * 3, "size": [0.1] * 3, "E": 1e5, "nu": 0.3, "density": 100.0}
@@ -70,7 +142,7 @@ BOX = {"point": [0.5] * 3, "size": [0.1] * 3, "E": 1e5, "nu": 0.3, "density": 10
 @pytest.mark.parametrize(
     ("box", "message"),
     [
-        (BOX | {"material": "sand"}, "'material' is not supported: PIXIE has it"),
+        (BOX | {"material": "snad"}, r"material of a box must be one of .*'sand'.*, got 'snad'"),
         (BOX | {"densty": 1.0}, "'densty' is unknown, the nearest known key is 'density'"),
         ({k: v for k, v in BOX.items() if k != "nu"}, "a box of additional_material_params must have nu"),
         (BOX | {"E": -1.0}, "E must be finite and not negative, got -1.0"),
@@ -96,7 +168,10 @@ def written(folder, content):
 
 
 OTHERS = [
-    ({"substep_perframe": 10}, "'substep_perframe' is not supported: MotionPhysics has it: give substep_dt"),
+    (
+        {"substep_perframe": 10},
+        "'substep_perframe' is not supported: MotionPhysics has it: pass dialect='motionphysics'",
+    ),
     ({"total_time": 1.0}, "'total_time' is not supported"),
     ({"opt_frame_dt": 1.0}, "'opt_frame_dt' is not supported"),
     ({"fix_ground": True}, "'fix_ground' is not supported"),
@@ -110,7 +185,7 @@ OTHERS = [
 @pytest.mark.parametrize(("content", "message"), OTHERS)
 def test_configurations(content, message, tmp_path):
     with pytest.raises(ValueError, match=message):
-        decode_param_json(written(tmp_path, content))
+        decode_param_json(written(tmp_path, content), "physgaussian")
 
 
 @pytest.mark.parametrize("key", configuration.NOT_OF_THE_SIMULATION)
@@ -125,7 +200,7 @@ def condition(kind):
     values = {"point": [0.5] * 3, "size": [0.1] * 3, "velocity": [0.0] * 3, "force": [0.0] * 3, "normal": [0, 0, 1]}
     values |= {"half_height_and_radius": [0.1, 0.1], "rotation_scale": 1.0, "translation_scale": 0.0}
     values |= {"surface": "sticky", "friction": 0.0, "start_time": 0.0, "end_time": 1.0}
-    values |= {"start_position": 0.6, "end_position": 0.4, "num_layers": 50}
+    values |= {"start_position": 0.6, "end_position": 0.4, "num_layers": 50, "radius": 0.1}
     return {"type": kind, **{key: values[key] for key in configuration.CONDITIONS[kind][1]}}
 
 
@@ -139,12 +214,6 @@ def test_conditions(kind):
 def test_impulses_need_the_time_step():
     with pytest.raises(ValueError, match="time_params must have substep_dt, got"):
         set_boundary_conditions(solver(), [{"type": "particle_impulse", "force": [0, 0, 1]}], {"frame_dt": 1e-2})
-
-
-@pytest.mark.parametrize("kind", configuration.OTHER_CONDITIONS)
-def test_conditions_of_descendants(kind):
-    with pytest.raises(ValueError, match=f"boundary condition {kind} is not supported"):
-        set_boundary_conditions(solver(), [{"type": kind}], {})
 
 
 @pytest.mark.parametrize("kind", mpm_pytorch.boundary_condition.CONDITIONS)
@@ -177,11 +246,21 @@ def test_a_yield_stress_of_zero_is_no_solid(material, value):
         one.finalize_mu_lam()
 
 
-@pytest.mark.parametrize("material", table.OTHER_MATERIALS)
-def test_materials_of_descendants(material):
-    one = solver()
+OTHER_MATERIALS = sorted({m for d in dialects.DIALECTS.values() for m in d.materials} - set(dialects.BASE_MATERIALS))
+
+
+@pytest.mark.parametrize("material", OTHER_MATERIALS)
+def test_materials_of_another_dialect(material):
+    one = solver(dialect="physgaussian")
     one.set_parameters_dict({"material": material, "E": 1e5, "nu": 0.3})
-    with pytest.raises(ValueError, match=f"material '{material}' is not supported; it is "):
+    with pytest.raises(ValueError, match=f"material '{material}' is that of .*: pass dialect= of one of "):
+        one.finalize_mu_lam()
+
+
+def test_a_material_without_a_law():
+    one = solver(dialect="pixie")
+    one.set_parameters_dict({"material": "rock_brittle", "E": 1e5, "nu": 0.3})
+    with pytest.raises(NotImplementedError, match=r"material 'rock_brittle' has no law: .*CamClay"):
         one.finalize_mu_lam()
 
 

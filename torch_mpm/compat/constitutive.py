@@ -7,6 +7,7 @@ stretches.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,9 +16,14 @@ from ..ops.law import law_update
 from ..ops.sand import friction_alpha
 
 
-def lame(E: Tensor, nu: Tensor) -> tuple[Tensor, Tensor]:
-    """μ and λ [Pa] of Young's modulus [Pa] and Poisson's ratio."""
+def lame(E: Any, nu: Any) -> tuple[Any, Any]:
+    """μ and λ [Pa] of Young's modulus [Pa] and Poisson's ratio, numbers or tensors."""
     return E / (2 * (1 + nu)), E * nu / ((1 + nu) * (1 - 2 * nu))
+
+
+def engineering(mu: Any, lam: Any) -> tuple[Any, Any]:
+    """Young's modulus [Pa] and Poisson's ratio of μ and λ [Pa], numbers or tensors."""
+    return mu * (3 * lam + 2 * mu) / (lam + mu), lam / (2 * (lam + mu))
 
 
 def corotated(F: Tensor, mu: Tensor, lam: Tensor) -> Tensor:

@@ -26,10 +26,15 @@ def check_keys(
         if unsupported and key in unsupported:
             problems.append(f"{key!r} is not supported: {unsupported[key]}")
         elif key not in known:
-            (nearest,) = difflib.get_close_matches(str(key), known, 1, 0.0)
-            problems.append(f"{key!r} is unknown, the nearest known key is {nearest!r}")
+            problems.append(f"{key!r} is unknown, the nearest known key is {nearest(key, known)!r}")
     if problems:
         raise ValueError(f"{what} must have known keys: {'; '.join(problems)}")
+
+
+def nearest(name: Any, known: Iterable[str]) -> str:
+    """The known name that is most similar to a name."""
+    (result,) = difflib.get_close_matches(str(name), list(known), 1, 0.0)
+    return result
 
 
 def checked_list(name: str, given: Any) -> list[Any]:

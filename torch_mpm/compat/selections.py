@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from ..errors import shape_of
 from ..state.state import State
 from ..step.particle_operations import Timed
 from .gradients import Numbers, number
@@ -61,6 +63,19 @@ def in_box(x: Tensor, point: Numbers, size: Numbers) -> Tensor:
     if bool((half.detach() < 0).any()):
         raise ValueError(f"size must not be negative, got {half.tolist()}")
     return ((x.detach() - centre).abs() < half).all(1)
+
+
+def chosen(name: str, mask: Any, x: Tensor) -> Tensor:
+    """A mask of particles as bool [P]: not zero where a particle is chosen.
+
+    Raises:
+        TypeError, ValueError: for another shape, or no integers or bool.
+    """
+    if not isinstance(mask, Tensor) or tuple(mask.shape) != (len(x),):
+        raise ValueError(f"{name} must have shape [P] = [{len(x)}], got {shape_of(mask)}")
+    if mask.is_floating_point() or mask.is_complex():
+        raise TypeError(f"{name} must be integers or bool, got {mask.dtype}")
+    return (mask >= 1 if mask.dtype != torch.bool else mask.clone()).to(x.device)
 
 
 def in_cylinder(

@@ -9,15 +9,20 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ...boundaries.apply import after_boundaries
 from ...errors import check_count, check_like, check_number, shape_of
-from ...grid.grid import Grid
+from ...grid.grid import Blocks, Grid
+from ...state.state import State
 from ...step.particle_operations import Operations
 from ...step.step import Step
 from ..given_stress import GivenStress, clamped, stepped
 from ..gradients import Numbers, check_fixed, refuse_grad, vector
 from ..node_conditions import NodeDamping
 from .call_times import CallTimes, is_recomputed
+from .user_functions import Written, dense, replaced, writes_grid, writes_particles
 
+LEAST_MASS = 1e-15
+"""Mass of a node [kg] up to which it has no velocity of its own."""
 LARGEST_ENTRY = 2.0
 """Bound to which entries of F are clamped."""
 RESET_STEPS = 15
@@ -83,22 +88,19 @@ class MPMSolver:
         self.dx, self.inv_dx = 1 / num_grids, float(num_grids)
         self.clip_bound = self.dx * check_number("clip_bound", clip_bound, "not negative", lambda v: v >= 0)
         self.damping = check_number("damping", damping, "between 0 and 1", lambda v: 0 <= v <= 1)
-        self.vol = math.prod(float(s) for s in size) / max(self.n_particles, 1)
+        self.vol: Any = math.prod(float(s) for s in size) / max(self.n_particles, 1)
         self.p_mass = rho * self.vol
         self.time = 0.0
         self.pre_particle_process: list[Any] = []
         self.post_grid_process: list[Any] = []
         self.displacement: Tensor | None = None
         self._times = CallTimes()
-        self.step = Step(
-            Grid(self.dx, (0.0,) * 3, (1.0,) * 3),
-            GivenStress(),
-            gravity=vector("gravity", gravity, self.init_pos),
-            stress_form="gradient",
-        )
+        self.step = Step(Grid(self.dx, (0.0,) * 3, (1.0,) * 3), GivenStress(), stress_form="gradient")
+        self.gravity = gravity
         self._acting: tuple[list[Any], list[Any]] | None = None
         self._changes = 0  # Lengths of the lists of conditions.
-        self._volume = torch.full((self.n_particles,), self.vol, dtype=torch.float64, device=self.device)
+        self._last: tuple[Any, ...] | None = None  # Arguments of the last call.
+        self._nodes: tuple[Tensor, Tensor] | None = None  # Of the last call, where they are known.
 
     def reset(self) -> None:
         """Set the time to zero."""
@@ -132,7 +134,7 @@ class MPMSolver:
                 conditions that have changed since.
         """
         check_like("x", x, x, (self.n_particles, 3), "[P, 3]")
-        self._set_boundaries()
+        self._set_boundaries(self._shows)
         recomputed = is_recomputed()
         if time is None:
             time = self._recomputed_time((x, v, C, F)) if recomputed else self.time
@@ -141,9 +143,9 @@ class MPMSolver:
         if not recomputed:
             self._times.store((x, v, C, F), (time, self._changes))
             self.time = time + self.dt
-        self.displacement = None
-        volume = self._volume.to(x)
-        mass = volume * (self.p_mass / self.vol)
+        self.displacement, self._now = None, time
+        self._last, self._nodes = (x, v, C, F, stress, time), None
+        volume, mass = (self._of_particles(name, getattr(self, name), x) for name in ("vol", "p_mass"))
         state = stepped(self.step, x, v, C, F, stress, mass, volume, time, self.dt)
         assert state.C is not None and state.F is not None
         # Weights are those of the positions before they are displaced, as in MPM-PyTorch.
@@ -170,16 +172,101 @@ class MPMSolver:
             )
         return last
 
-    def _set_boundaries(self) -> None:
-        """Add the new conditions of the lists to the step."""
+    def _of_particles(self, name: str, value: Any, x: Tensor) -> Tensor:
+        """A number, or a tensor [], [1] or [P], as [P] in the dtype of positions."""
+        tensor = torch.as_tensor(value, dtype=x.dtype, device=x.device)
+        if tuple(tensor.shape) not in ((), (1,), (self.n_particles,)):
+            raise ValueError(
+                f"{name} must be a number, or have shape [P] = [{self.n_particles}], got {shape_of(value)}"
+            )
+        return tensor.expand(self.n_particles)
+
+    def _set_boundaries(self, shows: bool) -> None:
+        """Add the new conditions of the lists to the step.
+
+        Args:
+            shows: whether the nodes are needed as `grid_mv`; conditions then act one after another in Python.
+        """
         lists = (list(self.pre_particle_process), list(self.post_grid_process))
-        if self._acting == lists:
+        on_dense_grid = shows or any(writes_grid(process) for process in lists[1])
+        if self._acting == lists and (self.step.on_grid is not None) == on_dense_grid:
             return
-        self._acting, self._changes = lists, self._changes + 1
-        operations, nodes = lists
+        self._changes += self._acting != lists
+        self._acting = lists
+        operations = [Written(self, o) if writes_particles(o) else o for o in lists[0]]
         self.step.on_particles = Operations(operations) if operations else None
         damping = [NodeDamping(self.damping)] if self.damping < 1 else []
-        self.step.boundaries = [*damping, *nodes]  # type: ignore[assignment]
+        self.step.on_grid = self._on_dense_grid if on_dense_grid else None
+        self.step.boundaries = damping if on_dense_grid else [*damping, *lists[1]]  # type: ignore[assignment]
+
+    # ---- the dense grid
+
+    _shows = False
+    _now: float | Tensor = 0.0
+
+    @property
+    def gravity(self) -> Tensor:
+        """Acceleration [3] [m/s²]; may be assigned, as three numbers or a tensor that may require grad."""
+        return self._gravity
+
+    @gravity.setter
+    def gravity(self, value: Numbers) -> None:
+        given = vector("gravity", value, self.init_pos)
+        self._gravity = torch.as_tensor(given, dtype=self.init_pos.dtype, device=self.device)
+        self.step.gravity = self._gravity
+
+    @property
+    def grid_x(self) -> Tensor:
+        """Indices of the nodes [n³, 3], float32; positions are these times dx."""
+        axis = torch.arange(self.num_grids, device=self.device, dtype=torch.float32)
+        return torch.cartesian_prod(axis, axis, axis)
+
+    @property
+    def grid_m(self) -> Tensor:
+        """Masses of the nodes [n³] [kg] in the last step. Computed again if no function of the grid has read them."""
+        return self._of_nodes()[1]
+
+    @property
+    def grid_mv(self) -> Tensor:
+        """Velocities of the nodes [n³, 3] [m/s] in the last step, after the conditions; within a function of
+        `post_grid_process` those before it, which it may write to or assign.
+        """
+        return self._of_nodes()[0]
+
+    @grid_mv.setter
+    def grid_mv(self, value: Tensor) -> None:
+        velocity, mass = self._of_nodes()
+        check_like("grid_mv", value, velocity, tuple(velocity.shape), "[n³, 3]")
+        self._nodes = value, mass
+
+    def _of_nodes(self) -> tuple[Tensor, Tensor]:
+        """`grid_mv` and `grid_m`."""
+        if self._nodes is None and self._last is not None:
+            self._shows, time = True, self.time
+            try:
+                self.p2g2p(*self._last)
+            finally:
+                self._shows, self.time = False, time
+        if self._nodes is None:
+            zero = torch.zeros(self.num_grids**3, 4, dtype=self.init_pos.dtype, device=self.device)
+            self._nodes = zero[:, :3], zero[:, 3]
+        return self._nodes
+
+    def _on_dense_grid(self, blocks: Blocks, velocity: Tensor, mass: Tensor, dt: float | Tensor) -> Tensor:
+        """The conditions on nodes, one after another, with functions of the dense grid among them."""
+        n, state = self.num_grids, State(*(velocity[:0, :3],) * 2, mass[:0], mass[:0], time=self._now)
+        rows = dense(blocks, torch.cat([velocity, mass[:, None]], 1), n)
+        empty = rows[:, 3:] <= LEAST_MASS
+        falling = self.damping * self.dt * self.gravity.to(rows)
+        self._nodes = torch.where(empty, falling, rows[:, :3]), rows[:, 3]
+        for process in self.post_grid_process:
+            if writes_grid(process):
+                process(self)
+                velocity = replaced(blocks, velocity, self._nodes[0], n)
+            else:
+                velocity, _ = after_boundaries(blocks, velocity, mass, [process], state, dt)
+                self._nodes = torch.where(empty, self._nodes[0], dense(blocks, velocity, n)), self._nodes[1]
+        return velocity
 
 
 def _may_change(condition: Any, first: float, last: float, dt: float) -> bool:

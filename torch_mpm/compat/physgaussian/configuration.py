@@ -1,4 +1,4 @@
-"""JSON configurations of PhysGaussian: defaults and boundary conditions."""
+"""JSON configurations of PhysGaussian and its descendants: defaults and boundary conditions."""
 
 from __future__ import annotations
 
@@ -8,10 +8,15 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+import torch
+from torch import Tensor
+
 from ...errors import check_number
 from ...files import read_text
+from ..gradients import refuse_grad
 from ..keys import check_keys, check_needed, checked_list
-from .parameters import BOX, BOX_UNSUPPORTED, UNSUPPORTED
+from .dialects import DIALECTS, PHYSGAUSSIAN, Dialect, dialect_of, recognised
+from .parameters import check_box
 from .simulator import MPM_Simulator_WARP
 
 MATERIAL: dict[str, Any] = {"material": "jelly", "grid_lim": 2.0, "n_grid": 50, "nu": 0.4, "E": 1e5, "density": 200.0}
@@ -19,10 +24,28 @@ MATERIAL_OPTIONS = (
     *("yield_stress", "hardening", "xi", "friction_angle", "plastic_viscosity", "g", "rpic_damping", "pic_damping"),
     *("softening", "opacity_threshold", "grid_v_damping_scale", "additional_material_params"),
 )
+MATERIAL_OF: dict[str, dict[str, Any]] = {
+    "physics3d": {"mu_N": 5, "lam_N": 5, "viscosity": 0.1},
+    "physflow": {"mu_N": 5, "lam_N": 5, "viscosity": 0.1},
+    "motionphysics": {"E": 1e-2, "viscosity": 0.1, "downsample_scale": 1.0},
+    "gaussianfluent": {"alpha_0": -0.04, "beta": 2, "flip_pic_ratio": 0.8},
+}
+"""Defaults of material parameters of each dialect."""
 TIME: dict[str, Any] = {"substep_dt": 1e-4, "frame_dt": 1e-2, "frame_num": 100}
+TIME_OF: dict[str, dict[str, Any]] = {
+    "physflow": {**TIME, "opt_frame_dt": 1e-2},
+    "motionphysics": {"substep_perframe": 256, "total_time": 3, "frame_num": 100},
+}
+"""Times of each dialect."""
 PREPROCESSING: dict[str, Any] = {
     **{"opacity_threshold": 0.02, "rotation_degree": [], "rotation_axis": [], "sim_area": None, "scale": 1.0},
     "particle_filling": None,
+}
+PREPROCESSING_OF: dict[str, dict[str, Any]] = {
+    "pixie": {
+        **{"nn_distance_threshold": 0.1, "to_original_coord": True, "z_shift_value": 0.0, "fix_ground": True},
+        **{"only_handle_largest_cluster": True, "k_smoothing_neighbors": 10, "out_of_bound_check_freq": 10},
+    },
 }
 FILLING: dict[str, Any] = {
     **{"density_threshold": 5.0, "search_threshold": 3.0, "max_particles_num": 2000000, "max_partciels_per_cell": 1},
@@ -33,14 +56,9 @@ CAMERA: dict[str, Any] = {
     **{"default_camera_index": 0, "show_hint": False, "init_azimuthm": None, "init_elevation": None},
     **{"init_radius": None, "delta_a": None, "delta_e": None, "delta_r": None, "move_camera": False},
 }
-OTHER_TIMES = "MotionPhysics has it: give substep_dt, frame_dt and frame_num"
-OTHER_KEYS = {
-    **UNSUPPORTED,
-    **{"substep_perframe": OTHER_TIMES, "total_time": OTHER_TIMES},
-    "opt_frame_dt": "PhysFlow has it for its optimisation: give frame_dt",
-    "fix_ground": "PIXIE has it: give a boundary condition",
-}
-"""Keys of descendants that change the simulation."""
+CAMERA_OF: dict[str, dict[str, Any]] = {"pixie": {"init_roll": 0.0, "delta_roll": 0.0}}
+OPTIMISATION = ("prompt", "lr", "line", "reduction", "bbox_2d")
+"""Keys that PhysFlow and MotionPhysics return as the sixth part of a configuration."""
 NOT_OF_THE_SIMULATION = (
     *("prompt", "lr", "line", "reduction", "downsample_scale", "bbox_2d"),  # MotionPhysics, PhysFlow
     *("init_roll", "delta_roll", "k_smoothing_neighbors", "nn_distance_threshold", "out_of_bound_check_freq"),  # PIXIE
@@ -72,67 +90,120 @@ CONDITIONS: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
         ("point", "normal", "half_height_and_radius", "rotation_scale", "translation_scale", "start_time", "end_time"),
         (),
     ),
+    "release_particles_sequentially_size": (
+        "release_particles_sequentially_size",
+        ("normal", "start_position", "end_position", "num_layers", "start_time", "end_time", "size", "point"),
+        (),
+    ),
+    "add_constant_force": ("add_constant_force", ("force", "point", "radius", "start_time", "end_time"), ()),
 }
 """For each type of a configuration: method of the simulator, required keys and optional keys."""
-OTHER_CONDITIONS = {
-    "add_constant_force": "MotionPhysics has it: use particle_impulse with num_dt",
-    "release_particles_sequentially_size": "PhysFlow has it: use release_particles_sequentially",
-}
-"""Types of descendants."""
+CUBOID_END = 1e3
 
 
-def decode_param_json(
-    json_file: str | Path,
-) -> tuple[dict[str, Any], Any, dict[str, Any], dict[str, Any], dict[str, Any]]:
+class MaterialParameters(dict[str, Any]):
+    """Parameters of `set_parameters_dict` with the dialect of their configuration."""
+
+    dialect: Dialect | None = None
+
+    def copy(self) -> MaterialParameters:
+        """A copy with the dialect."""
+        return self | {}
+
+    def __or__(self, other: Any) -> MaterialParameters:  # type: ignore[override]
+        result = MaterialParameters({**self, **other})
+        result.dialect = self.dialect
+        return result
+
+
+def decode_param_json(json_file: str | Path, dialect: str | None = None) -> tuple[Any, ...]:
     """Parts of a configuration with their defaults.
 
     Keys of descendants for their training and pictures are ignored with a warning.
 
+    Args:
+        json_file: a JSON file.
+        dialect: project of the configuration, see `DIALECTS`; None for PhysGaussian, or the one whose keys it has.
+
     Returns:
-        Parameters of `set_parameters_dict`; the list of boundary conditions; substep_dt, frame_dt [s] and frame_num;
-        parameters of the preparation of Gaussians, and of the camera, which torch_mpm does not use.
+        Parameters of `set_parameters_dict`; the list of boundary conditions; substep_dt, frame_dt [s] and frame_num,
+        or the times of the dialect; parameters of the preparation of Gaussians, and of the camera, which torch_mpm does
+        not use; in the dialects of PhysFlow and MotionPhysics those of the optimisation too.
 
     Raises:
-        ValueError: for an unknown key, a key of a descendant that changes the simulation, a Poisson's ratio outside
-            [0, 0.5], or a box of material parameters that lacks one.
+        ValueError: for an unknown key, keys of several dialects, a Poisson's ratio outside [0, 0.5], or a box of
+            material parameters that lacks one.
     """
     given = json.loads(read_text(json_file, "configuration"))
     if not isinstance(given, Mapping):
         raise TypeError(f"the configuration must be a mapping, got {type(given).__name__}")
-    _check_configuration(given)
+    chosen = _dialect(given, dialect)
+    own = PHYSGAUSSIAN if chosen is None else chosen
+    _check_configuration(given, own)
 
     def part(defaults: Mapping[str, Any]) -> dict[str, Any]:
         return {name: given.get(name, value) for name, value in defaults.items()}
 
-    material = part(MATERIAL) | {name: given[name] for name in MATERIAL_OPTIONS if name in given}
+    options = (*MATERIAL_OPTIONS, *own.keys, *own.without_effect)
+    material = MaterialParameters(part({**MATERIAL, **MATERIAL_OF.get(own.name, {})}))
+    material.update({name: given[name] for name in options if name in given})
+    material.dialect = chosen
     check_number("nu", material["nu"], "between 0 and 0.5", lambda v: 0 <= v <= 0.5)
     for box in checked_list("additional_material_params", material.get("additional_material_params", [])):
-        check_keys(A_BOX, box, BOX, BOX_UNSUPPORTED)
+        check_box(A_BOX, box, own)
         check_needed(A_BOX, box, ("point", "size", "E", "nu"))
         box.setdefault("density", material["density"])
-    preprocessing = part(PREPROCESSING)
+    preprocessing = part({**PREPROCESSING, **PREPROCESSING_OF.get(own.name, {})})
     if preprocessing["particle_filling"] is not None:
         checked_list("particle_filling", [preprocessing["particle_filling"]])
         filling = {"n_grid": 4 * material["n_grid"], **FILLING}
         check_keys("particle_filling", preprocessing["particle_filling"], filling)
         preprocessing["particle_filling"] = filling | preprocessing["particle_filling"]
-    return material, given.get("boundary_conditions", {}), part(TIME), preprocessing, part(CAMERA)
+    times, camera = part(TIME_OF.get(own.name, TIME)), part({**CAMERA, **CAMERA_OF.get(own.name, {})})
+    parts = material, given.get("boundary_conditions", {}), times, preprocessing, camera
+    if own.name not in ("physflow", "motionphysics"):
+        return parts
+    return *parts, {"reduction": "sum"} | {name: given[name] for name in OPTIMISATION if name in given}
+
+
+def _dialect(given: Mapping[str, Any], dialect: str | None) -> Dialect | None:
+    """The given dialect, or that of the keys of a configuration."""
+    if dialect is not None:
+        return dialect_of(dialect)
+    boxes = given.get("additional_material_params", ())
+    of_boxes = {key for box in boxes if isinstance(box, Mapping) for key in box} if isinstance(boxes, list) else set()
+    return recognised(given, given.get("material"), given, of_boxes)
 
 
 def set_boundary_conditions(
-    mpm_solver: MPM_Simulator_WARP, bc_params: Iterable[Mapping[str, Any]], time_params: Mapping[str, Any]
-) -> None:
+    mpm_solver: MPM_Simulator_WARP,
+    bc_params: Iterable[Mapping[str, Any]],
+    time_params: Mapping[str, Any],
+    freeze_pts: Tensor | None = None,
+    sim_pos: Tensor | None = None,
+) -> list[dict[str, Any]]:
     """Add the boundary conditions of a configuration to a simulator, in their order.
+
+    Args:
+        mpm_solver: the simulator.
+        bc_params: mappings with a type and its keys.
+        time_params: times of the configuration.
+        freeze_pts: points [Q, 3] [m]; the nodes of their cells are held at rest, as in MotionPhysics.
+        sim_pos: not used: the particles of the simulator count.
+
+    Returns:
+        Arrows of the forces for pictures, as MotionPhysics returns them: force, point, start_frame and end_frame.
 
     Raises:
         TypeError: for an unknown type.
-        ValueError: for a missing or unknown key, or a type of a descendant.
+        ValueError: for a missing or unknown key.
     """
+    if freeze_pts is not None:
+        _freeze(mpm_solver, freeze_pts)
+    arrows = []
     for condition in checked_list("boundary_conditions", bc_params):
         check_needed("a boundary condition", condition, ("type",))
         kind = condition["type"]
-        if kind in OTHER_CONDITIONS:
-            raise ValueError(f"boundary condition {kind} is not supported: {OTHER_CONDITIONS[kind]}")
         if kind not in CONDITIONS:
             raise TypeError(f"type of a boundary condition must be one of {sorted(CONDITIONS)}, got {kind!r}")
         method, needed, optional = CONDITIONS[kind]
@@ -140,16 +211,78 @@ def set_boundary_conditions(
         check_needed(f"a boundary condition {kind}", condition, needed)
         arguments = {name: condition[name] for name in (*needed, *optional) if name in condition}
         if kind == "particle_impulse":
-            check_needed("time_params", time_params, ("substep_dt",))
-            arguments["dt"] = time_params["substep_dt"]
+            arguments["dt"] = substep_of(time_params)
         if kind == "cuboid":
-            arguments.setdefault("end_time", 1e3)
+            arguments.setdefault("end_time", CUBOID_END)
         getattr(mpm_solver, method)(**arguments)
+        if "force" in condition:
+            arrows.append(_arrow(mpm_solver, condition, time_params))
+    return arrows
 
 
-def _check_configuration(given: Mapping[str, Any]) -> None:
-    known = (*MATERIAL, *MATERIAL_OPTIONS, *TIME, *PREPROCESSING, *CAMERA, "boundary_conditions")
-    left_out = sorted(set(given) & set(NOT_OF_THE_SIMULATION))
+def substep_of(time_params: Mapping[str, Any]) -> float:
+    """Time of a substep [s]: substep_dt, or total_time over the number of substeps.
+
+    Raises:
+        ValueError: without either.
+    """
+    if "substep_perframe" in time_params:
+        check_needed("time_params", time_params, ("total_time", "frame_num"))
+        steps = time_params["frame_num"] * time_params["substep_perframe"]
+        return float(time_params["total_time"]) / float(steps)
+    check_needed("time_params", time_params, ("substep_dt",))
+    return time_params["substep_dt"]
+
+
+def _freeze(mpm_solver: MPM_Simulator_WARP, points: Tensor) -> None:
+    """Hold the nodes of the cells of some points at rest."""
+    refuse_grad("it selects nodes", freeze_pts=points)
+    n = int(mpm_solver.mpm_model.n_grid)
+    x = mpm_solver.state.x
+    i, j, k = (points.detach().to(x) * mpm_solver.mpm_model.inv_dx).long().clamp(0, n - 1).unbind(1)
+    mask = torch.zeros(n, n, n, dtype=torch.bool, device=x.device)
+    mask[i, j, k] = True
+    mpm_solver.enforce_grid_velocity_by_mask(mask)
+
+
+def _arrow(
+    mpm_solver: MPM_Simulator_WARP, condition: Mapping[str, Any], time_params: Mapping[str, Any]
+) -> dict[str, Any]:
+    """An arrow of 0.1 m for a force, at the particle next to its point, and its first and last frame."""
+    x = mpm_solver.state.x.detach()
+    force, point = (
+        torch.as_tensor(condition.get(name, (1, 1, 1)), dtype=x.dtype, device=x.device).detach()
+        for name in ("force", "point")
+    )
+    dt, start = substep_of(time_params), float(condition.get("start_time", 0.0))
+    end = float(condition["end_time"]) if "end_time" in condition else start + dt * condition.get("num_dt", 1)
+    frame = (
+        dt * time_params["substep_perframe"] if "substep_perframe" in time_params else time_params.get("frame_dt", dt)
+    )
+    nearest = int((x - point).norm(dim=1).argmin()) if len(x) else 0
+    return {
+        "force": 0.1 * force / force.norm(),
+        "point": x[nearest] if len(x) else point,
+        "start_frame": int(start / frame),
+        "end_frame": int(end / frame),
+    }
+
+
+def _check_configuration(given: Mapping[str, Any], dialect: Dialect) -> None:
+    """Check the keys of a configuration; warn of those without effect."""
+    known = (
+        *(*MATERIAL, *MATERIAL_OPTIONS, *dialect.keys, *dialect.without_effect, *TIME_OF.get(dialect.name, TIME)),
+        *(*PREPROCESSING, *PREPROCESSING_OF.get(dialect.name, {}), *CAMERA, *CAMERA_OF.get(dialect.name, {})),
+        *(OPTIMISATION if dialect.name in ("physflow", "motionphysics") else ()),
+        "boundary_conditions",
+    )
+    ignored = {*NOT_OF_THE_SIMULATION, *dialect.without_effect} - {*OPTIMISATION} | {*OPTIMISATION} - {*known}
+    left_out = sorted(key for key in given if key in ignored and key not in PREPROCESSING_OF.get(dialect.name, {}))
     if left_out:
         warnings.warn(f"keys of the configuration that have no effect: {', '.join(left_out)}", stacklevel=3)
-    check_keys("the configuration", (name for name in given if name not in left_out), known, OTHER_KEYS)
+    others = {}
+    for other in DIALECTS.values():
+        for key in (*other.keys, *other.without_effect, *other.configuration):
+            if key not in known:
+                others[key] = f"{other.project} has it: pass dialect={other.name!r}"
+    check_keys("the configuration", (name for name in given if name not in left_out), known, others)

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ...errors import check_like
 from ...ops.svd import polar
 from ...state.state import State
 
@@ -16,6 +17,11 @@ class Exchange:
 
     _state: State | None
     _covariance: Tensor | None
+    _exports: dict[str, Any]
+
+    def _stress(self) -> Tensor:
+        """Kirchhoff stress of the present particles [P, 3, 3] [Pa]."""
+        raise NotImplementedError
 
     def _flush(self) -> None:
         """Compute the pending substeps."""
@@ -39,6 +45,31 @@ class Exchange:
     def state(self, state: State) -> None:
         self._flush()
         self._state = state
+
+    def initial_covariance(self) -> Tensor:
+        """Covariances of the Gaussians at the start, [P, 6]."""
+        state = self._loaded()
+        return torch.zeros_like(state.x).repeat(1, 2) if self._covariance is None else self._covariance
+
+    def assign_covariance(self, cov: Tensor) -> None:
+        """Set the covariances of the Gaussians at the start, [P, 6] or [6 P]: xx xy xz yy yz zz."""
+        x = self._loaded().x
+        self._covariance = cov.to(x).reshape(-1, 6)
+        check_like("tensor_cov", self._covariance, x, (len(x), 6), "[P, 6]")
+
+    def exported(self, name: str) -> Tensor:
+        """particle_cov, particle_R or particle_stress; the same tensor until the particles change."""
+        state, grad = self._flushed(), torch.is_grad_enabled()
+        if self._exports.get("of") is not state or self._exports["grad"] != grad:
+            self._exports = {"of": state, "grad": grad}
+        if name not in self._exports:
+            self._exports[name] = {
+                "particle_cov": self._moved_covariance,
+                "particle_R": self._transposed_rotation,
+                "particle_stress": self._stress,
+            }[name]()
+        result: Tensor = self._exports[name]
+        return result
 
     def _import(self, name: str, value: Tensor | None, rows: tuple[int, ...]) -> None:
         if value is None:
@@ -80,19 +111,33 @@ class Exchange:
 
     def export_particle_R_to_torch(self, device: Any = None) -> Tensor:
         """The transposed rotations Rᵀ of the polar decomposition F = R S, rows of nine [P, 9]."""
-        state = self._flushed()
-        assert state.F is not None
-        return self._rows(polar(state.F).R.mT)
+        return self._rows(self.exported("particle_R"))
 
     def export_particle_cov_to_torch(self, device: Any = None) -> Tensor:
         """Covariances F Σ Fᵀ of the Gaussians, six numbers xx xy xz yy yz zz per particle in one row [6 P]."""
-        state = self._flushed()
-        assert state.F is not None
-        given = torch.zeros_like(state.x).repeat(1, 2) if self._covariance is None else self._covariance
-        full = given[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].unflatten(1, (3, 3))
-        moved = state.F @ full @ state.F.mT
-        return moved.flatten(1)[:, [0, 1, 2, 4, 5, 8]].reshape(-1)
+        return self.exported("particle_cov")
+
+    def export_particle_stress_to_torch(self) -> Tensor:
+        """Kirchhoff stress of the present particles [P, 3, 3] [Pa], of F after the return map."""
+        return self.exported("particle_stress")
+
+    def _transposed_rotation(self) -> Tensor:
+        F = self._loaded().F
+        assert F is not None
+        return polar(F).R.mT
+
+    def _moved_covariance(self) -> Tensor:
+        F = self._loaded().F
+        assert F is not None
+        return moved_covariance(F, self.initial_covariance())
 
     def _rows(self, matrices: Tensor | None) -> Tensor:
         assert matrices is not None
         return matrices.reshape(-1, 9)
+
+
+def moved_covariance(F: Tensor, given: Tensor) -> Tensor:
+    """F Σ Fᵀ as one row [6 P] of xx xy xz yy yz zz, for F [P, 3, 3] and Σ [P, 6] in this form."""
+    full = given[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].unflatten(1, (3, 3))
+    moved = F @ full @ F.mT
+    return moved.flatten(1)[:, [0, 1, 2, 4, 5, 8]].reshape(-1)

@@ -10,50 +10,21 @@ import torch
 from torch import Tensor
 
 from ...geometry.vectors import norm
-from ...laws import FixedCorotated, Material, QuarticSand, isotropic
-from ...laws.parameters import evaluate, store
-from .parameters import check_gradients, check_material
+from ...laws import FixedCorotated, Material, QuarticSand, WeaklyCompressible, isotropic
+from ..constitutive import lame
+from .clay import NonAssociativeCamClay
+from .distortion import DistortionalFluid, StretchedNeoHookean
+from .parameters import hardens
+from .stretches import StretchPlasticity, strain_deviator, stretched_hencky
+from .viscous_branch import ViscousJelly
 
 if TYPE_CHECKING:
     from ...state.state import State
 
-LEAST_STRETCH = 0.01
-"""Lower bound of a stretch in logarithms."""
+FLUID_EXPONENT = 1.1
+"""Exponent of the pressure of fluids, K (J^-γ − 1)."""
 NORM_OFFSET = 1e-6
 """Added to the norm of the strain deviator in the von Mises return maps."""
-
-
-class StretchPlasticity(Material):
-    """Return map in the logarithms of the stretches, with parameters as numbers or tensors [] or [P].
-
-    Args:
-        E, nu: Young's modulus [Pa] and Poisson's ratio.
-        others: further parameters by name.
-    """
-
-    def __init__(self, E: Any, nu: Any, **others: Any) -> None:
-        super().__init__()
-        self._named = ("E", "nu", *others)
-        for name, value in {"E": E, "nu": nu, **others}.items():
-            store(self, name, value)
-
-    def initial(self, name: str, state: State) -> Tensor:
-        """History begins with the parameter of its name; without one, with one."""
-        start = evaluate(name, getattr(self, name), state) if name in self._named else 1.0
-        return torch.zeros_like(state.mass) + start
-
-    def _column(self, name: str, state: State) -> Any:
-        """A parameter that broadcasts with [P, D]."""
-        value = evaluate(name, getattr(self, name), state)
-        return value[:, None] if isinstance(value, Tensor) and value.dim() else value
-
-    def _moduli(self, state: State) -> tuple[Any, Any]:
-        E, nu = self._column("E", state), self._column("nu", state)
-        return E / (2 * (1 + nu)), E * nu / ((1 + nu) * (1 - 2 * nu))
-
-    def invalid(self, state: State) -> Tensor:
-        assert state.F is not None
-        return ~state.F.isfinite().all((1, 2))
 
 
 class Metal(StretchPlasticity):
@@ -79,7 +50,7 @@ class Metal(StretchPlasticity):
 
         def flow(sigma: Tensor) -> tuple[Tensor, Tensor, Tensor]:
             mapped, excess = _von_mises(sigma, mu, limit)
-            return mapped, _stretched_hencky(mapped, mu, lam), limit + 2 * mu * xi * excess
+            return mapped, stretched_hencky(mapped, mu, lam), limit + 2 * mu * xi * excess
 
         F, stress, limit = isotropic(state.F, flow)
         return {"F": F, "yield_stress": limit[:, 0]}, stress
@@ -107,7 +78,7 @@ class Foam(StretchPlasticity):
         dt = getattr(state, "dt", 0.0)  # Outside a step there is no flow.
 
         def flow(sigma: Tensor) -> tuple[Tensor, Tensor]:
-            clamped, mean, deviator = _deviator(sigma)
+            clamped, mean, deviator = strain_deviator(sigma)
             size = norm(deviator)[:, None]
             trial = 2 * mu * size
             flows = (trial > limit) & (size > 0)
@@ -115,7 +86,7 @@ class Foam(StretchPlasticity):
             kept = trial - (trial - limit) * fluidity / (fluidity + viscosity).clamp_min(1e-30)
             share = torch.where(flows, kept, 1) / torch.where(flows, trial, 1)
             mapped = torch.where(flows, (mean + share * deviator).exp(), sigma)
-            return mapped, _stretched_hencky(mapped, mu, lam)
+            return mapped, stretched_hencky(mapped, mu, lam)
 
         F, stress = isotropic(state.F, flow)
         return {"F": F}, stress
@@ -131,14 +102,18 @@ class Plasticine(StretchPlasticity):
         E, nu, yield_stress: [Pa], -, [Pa]: numbers or tensors [] or [P].
         softening: [Pa], likewise.
         xi: hardening of the yield stress as for `Metal`; 0 for none.
+        corotated: whether the stress is fixed corotated, as in PhysGaussian, or that of `Metal`, as in PhysFlow.
     """
 
     extra_fields = ("yield_stress", "intact")
     softening: Any
     xi: Any
 
-    def __init__(self, E: Any, nu: Any, yield_stress: Any, softening: Any = 0.1, xi: Any = 0.0) -> None:
+    def __init__(
+        self, E: Any, nu: Any, yield_stress: Any, softening: Any = 0.1, xi: Any = 0.0, corotated: bool = True
+    ) -> None:
         super().__init__(E, nu, yield_stress=yield_stress, softening=softening, xi=xi)
+        self.corotated = corotated
 
     def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
         assert state.F is not None
@@ -149,29 +124,22 @@ class Plasticine(StretchPlasticity):
         def flow(sigma: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
             whole = (intact > 0) & (limit > 0)
             mapped, excess = _von_mises(sigma, full_mu, torch.where(whole, limit, torch.inf))
-            size = norm(_deviator(sigma)[2])[:, None]
+            size = norm(strain_deviator(sigma)[2])[:, None]
             softened = limit - softening * excess * size / (size + NORM_OFFSET)
             left = torch.where((softened > 0) | (excess == 0), intact, 0)
             mu, lam = full_mu * left, full_lam * left
             J = mapped.prod(1, keepdim=True)
             tau = 2 * mu * (mapped - 1) * mapped + lam * J * (J - 1)
+            tau = tau if self.corotated else stretched_hencky(mapped, mu, lam)
             return mapped, tau, softened + 2 * mu * xi * excess, left
 
         F, stress, limit, left = isotropic(state.F, flow)
         return {"F": F, "yield_stress": limit[:, 0], "intact": left[:, 0]}, stress
 
 
-def _deviator(sigma: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Stretches bounded from below [P, D], and the mean [P, 1] and the deviator [P, D] of their logarithms."""
-    clamped = sigma.clamp_min(LEAST_STRETCH)
-    strain = clamped.log()
-    mean = strain.mean(1, keepdim=True)
-    return clamped, mean, strain - mean
-
-
 def _von_mises(sigma: Tensor, mu: Any, limit: Tensor) -> tuple[Tensor, Tensor]:
     """Stretches [P, D] with |dev 2 μ ε| ≤ limit, and the excess of the strain, [P, 1]."""
-    _, mean, deviator = _deviator(sigma)
+    _, mean, deviator = strain_deviator(sigma)
     size = norm(deviator)[:, None]
     stiffness = 2 * mu * torch.ones_like(size)
     flows = stiffness * size > limit
@@ -181,39 +149,56 @@ def _von_mises(sigma: Tensor, mu: Any, limit: Tensor) -> tuple[Tensor, Tensor]:
     return mapped, torch.where(flows, size - bound, 0)
 
 
-def _stretched_hencky(sigma: Tensor, mu: Any, lam: Any) -> Tensor:
-    """The simulator's stress of metal and foam: (2 μ ε + λ tr ε) σ, the Kirchhoff stress of Hencky's law times σ."""
-    strain = sigma.clamp_min(LEAST_STRETCH).log()
-    return (2 * mu * strain + lam * strain.sum(1, keepdim=True)) * sigma
-
-
-def law_of(parameters: Mapping[str, Any]) -> Material:
-    """Law of the parameters of a simulator, under the names of `set_parameters_dict`.
+def law_of(kind: str, parameters: Mapping[str, Any]) -> Material:
+    """Law of a kind of material with parameters in SI units under the names of `set_parameters_dict`.
 
     Raises:
-        ValueError, TypeError: for snow, which has no stress in PhysGaussian, an unknown material, or one that lacks a
-            parameter.
+        ValueError: for snow, which has no stress in PhysGaussian.
     """
-    kind = parameters.get("material", "jelly")
-    if isinstance(kind, Material):
-        check_gradients(parameters, (), "a law")
-        return kind
     if kind == "snow":
         raise ValueError(
             "material 'snow' has no stress in the simulator that this class stands for: its particles fly apart. Pass "
             "a law instead, such as material=torch_mpm.Snow(E=1.4e5, nu=0.2)"
         )
-    check_material(kind, parameters)
-    E, nu = parameters["E"], parameters["nu"]
+    if kind in ("fluid", "fluid of bulk"):
+        bulk = parameters["bulk_modulus" if kind == "fluid" else "bulk"]
+        return WeaklyCompressible(bulk_modulus=FLUID_EXPONENT * bulk, gamma=FLUID_EXPONENT)
+    if kind == "stationary":
+        return FixedCorotated(mu=0.0, lam=0.0)
+    if kind == "newtonian of mu and bulk":
+        return DistortionalFluid(mu=parameters["mu"], bulk=parameters["bulk"])
+    return _solid(kind, parameters["E"], parameters["nu"], parameters)
+
+
+def _solid(kind: str, E: Any, nu: Any, parameters: Mapping[str, Any]) -> Material:
+    """Law of a material with Young's modulus and Poisson's ratio."""
+    xi = parameters.get("xi", 0.0) if hardens(kind, parameters) else 0.0
     if kind == "jelly":
         return FixedCorotated(E=E, nu=nu)
-    if kind == "sand":
+    if kind == "viscous jelly":
+        return ViscousJelly(E, nu, *(parameters[name] for name in ("mu_N", "lam_N", "viscosity")))
+    if kind in ("sand", "sand of an angle"):
         angle = math.pi / 180 * parameters.get("friction_angle", 25.0)
         return QuarticSand(E=E, nu=nu, friction_angle=angle, energy="hencky")
+    if kind in ("newtonian", "neo-hookean"):
+        mu, lam = lame(E, nu)
+        if kind == "newtonian":
+            return DistortionalFluid(mu=mu, bulk=lam + 2 / 3 * mu)
+        return StretchedNeoHookean(E, nu)
+    if kind == "watermelon":
+        return NonAssociativeCamClay(E, nu, xi=xi, hardens=hardens(kind, parameters), **_clay(parameters))
     limit = parameters["yield_stress"]
-    xi = parameters.get("xi", 0.0) if parameters.get("hardening", 0) == 1 else 0.0
-    if kind == "metal":
+    if kind in ("metal", "hardening metal"):
         return Metal(E, nu, limit, xi)
     if kind == "foam":
         return Foam(E, nu, limit, parameters.get("plastic_viscosity", 0.0))
-    return Plasticine(E, nu, limit, parameters.get("softening", 0.1), xi)
+    softening = parameters.get("softening", 0.1 if kind == "plasticine" else 0.0)
+    return Plasticine(E, nu, limit, softening, xi, corotated=kind == "plasticine")
+
+
+def _clay(parameters: Mapping[str, Any]) -> dict[str, Any]:
+    """Slope, cohesion and initial history of the clay of a friction angle [degrees]."""
+    angle = parameters.get("friction_angle", 45.0)
+    sine = torch.deg2rad(angle).sin() if isinstance(angle, Tensor) else math.sin(math.radians(angle))
+    slope = 6 * sine / (3 - sine)
+    return {"slope": slope, "beta": parameters["beta"], "log_plastic_volume": parameters.get("alpha_0", -0.04)}

@@ -1,6 +1,4 @@
-"""Parameters of `set_parameters_dict`: ranges, required and optional parameters of each material, and keys of
-descendants.
-"""
+"""Parameters of `set_parameters_dict`: ranges, and required and optional parameters of each material."""
 
 from __future__ import annotations
 
@@ -13,6 +11,8 @@ from torch import Tensor
 
 from ...errors import check_count, check_number, shape_of
 from ..gradients import refuse_grad, requires_grad, vector
+from ..keys import check_keys
+from .dialects import DIALECTS, Dialect
 
 FINITE, NOT_NEGATIVE, POSITIVE = "finite", "finite and not negative", "finite and positive"
 RANGES: dict[str, tuple[str, Callable[[Any], Any]]] = {
@@ -26,29 +26,20 @@ RANGES: dict[str, tuple[str, Callable[[Any], Any]]] = {
     "softening": (NOT_NEGATIVE, lambda v: v >= 0),
     "rpic_damping": ("finite and at most 1", lambda v: v <= 1),
     "grid_v_damping_scale": (NOT_NEGATIVE, lambda v: v >= 0),
+    "mu_N": (NOT_NEGATIVE, lambda v: v >= 0),
+    "lam_N": (NOT_NEGATIVE, lambda v: v >= 0),
+    "viscosity": (POSITIVE, lambda v: v > 0),
+    "mu": (NOT_NEGATIVE, lambda v: v >= 0),
+    "bulk": (NOT_NEGATIVE, lambda v: v >= 0),
+    "bulk_modulus": (NOT_NEGATIVE, lambda v: v >= 0),
+    "alpha_0": (FINITE, lambda v: v == v),
+    "beta": (NOT_NEGATIVE, lambda v: v >= 0),
+    "flip_pic_ratio": ("between 0 and 1", lambda v: (v >= 0) & (v <= 1)),
 }
 """Range of each parameter in words, and its test."""
-OF_THE_WHOLE = ("rpic_damping", "grid_v_damping_scale")
+OF_THE_WHOLE = ("rpic_damping", "grid_v_damping_scale", "flip_pic_ratio")
 """Parameters without a value per particle."""
-KNOWN = (*RANGES, "material", "grid_lim", "n_grid", "hardening", "g", "additional_material_params")
-WITHOUT_EFFECT = ("pic_damping", "opacity_threshold")
-"""Keys that PhysGaussian's `decode_param_json` stores among the parameters, and its simulator does not read."""
 BOX = ("point", "size", "E", "nu", "density")
-
-LAW = "give a law as material, such as torch_mpm.Viscoelastic"
-CAMCLAY = "GaussianFluent has it for its watermelon: give material=torch_mpm.CamClay(...)"
-FLUID = "fluids need a law as material, such as torch_mpm.WeaklyCompressible"
-UNSUPPORTED = {
-    **{name: f"Physics3D has it for a viscous branch: {LAW}" for name in ("mu_N", "lam_N", "viscosity")},
-    "mu": "MotionPhysics has it: give E and nu",
-    **{"bulk": f"MotionPhysics has it: {FLUID}", "bulk_modulus": f"PIXIE has it: {FLUID}"},
-    "spawn_offset": "PIXIE has it: move the positions before they are loaded",
-    "flip_pic_ratio": "GaussianFluent has it: steps here are APIC, or PIC with rpic_damping=-1",
-    **{"alpha_0": CAMCLAY, "beta": CAMCLAY},
-    "dx": "others have it in the place of n_grid, which is grid_lim / dx",
-}
-"""Keys of descendants of PhysGaussian's simulator."""
-BOX_UNSUPPORTED = {"material": "PIXIE has it; all particles of a simulator here have one material"}
 
 USED: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "jelly": (("E", "nu"), ()),
@@ -56,16 +47,29 @@ USED: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "sand": (("E", "nu"), ("friction_angle",)),
     "foam": (("E", "nu", "yield_stress"), ("plastic_viscosity",)),
     "plasticine": (("E", "nu", "yield_stress"), ("softening", "hardening", "xi")),
+    "viscous jelly": (("E", "nu", "mu_N", "lam_N", "viscosity"), ()),
+    "hardening metal": (("E", "nu", "yield_stress"), ("hardening", "xi")),
+    "softening metal": (("E", "nu", "yield_stress"), ("softening", "hardening", "xi")),
+    "sand of an angle": (("E", "nu", "friction_angle"), ()),
+    "newtonian": (("E", "nu"), ()),
+    "newtonian of mu and bulk": (("mu", "bulk"), ()),
+    "fluid": (("bulk_modulus",), ()),
+    "fluid of bulk": (("bulk",), ()),
+    "stationary": ((), ()),
+    "watermelon": (("E", "nu", "beta"), ("alpha_0", "xi", "hardening", "friction_angle")),
+    "neo-hookean": (("E", "nu"), ()),
 }
-"""Required and optional parameters of each material."""
-OF_LAWS = ("E", "nu", "yield_stress", "hardening", "xi", "friction_angle", "plastic_viscosity", "softening")
-OTHER_MATERIALS = {
-    **{"elastic": "PhysFlow's; 'jelly' is elastic", "neo-hookean": "PhysDreamer's; give torch_mpm.NeoHookean"},
-    **{name: f"PhysFlow's; {FLUID}" for name in ("newtonian", "non_newtonian")},
-    **{"fluid": f"PIXIE's and MotionPhysics's; {FLUID}", "stationary": "PIXIE's; hold particles at rest instead"},
-    **{"rock_brittle": "PIXIE's; give a law", "watermelon": "GaussianFluent's; give torch_mpm.CamClay"},
+"""Required and optional parameters of each kind of material."""
+OF_LAWS = (
+    *("E", "nu", "yield_stress", "hardening", "xi", "friction_angle", "plastic_viscosity", "softening"),
+    *("mu_N", "lam_N", "viscosity", "mu", "bulk", "bulk_modulus", "alpha_0", "beta"),
+)
+HARDENING_BY_ITS_KEY = ("hardening metal", "softening metal")
+"""Kinds that harden where `hardening` is given, with any value."""
+WITHOUT_LAW = {
+    "rock_brittle": "PIXIE names it without a law: pass material=torch_mpm.CamClay(...), 'metal' or 'plasticine'",
 }
-"""Materials of descendants."""
+"""Materials of descendants that have no law in their own simulator."""
 
 
 def checked(name: str, value: Any, like: Tensor) -> Any:
@@ -78,7 +82,7 @@ def checked(name: str, value: Any, like: Tensor) -> Any:
         if isinstance(value, (int, float)):
             raise TypeError(f"g must be three numbers, got {value}")
         return vector("g", value, like)
-    if name in ("n_grid", "grid_lim", "hardening"):
+    if name in ("n_grid", "grid_lim", "hardening", "flip_pic_ratio"):
         refuse_grad("it is a number of the whole simulation", **{name: value})
     if name == "n_grid":
         return check_count("n_grid", value, 1)
@@ -113,30 +117,62 @@ def _in_range(name: str, value: Any, like: Tensor) -> float | Tensor:
     return tensor.reshape(()) if one else tensor
 
 
-def check_material(material: Any, parameters: Mapping[str, Any]) -> None:
-    """Check that a material is known and has all required parameters.
+def check_box(what: str, box: Mapping[str, Any], dialect: Dialect) -> None:
+    """Check that the keys of a box of additional_material_params are those of a dialect.
+
+    Raises:
+        ValueError: for another key.
+    """
+    others = {} if "material" in dialect.box_keys else {"material": "pass dialect='pixie', which has it"}
+    check_keys(what, box, (*BOX, *dialect.box_keys), others)
+
+
+def kind_of(dialect: Dialect, material: Any) -> str:
+    """Kind of a material of a dialect.
 
     Raises:
         TypeError: for an unknown material.
-        ValueError: for a material of a descendant, or a parameter that is missing, out of the range of the material, or
-            requires grad without effect.
+        NotImplementedError: for one that has no law.
+        ValueError: for a material of another dialect.
     """
-    if not isinstance(material, str) or material not in USED:
-        if material in OTHER_MATERIALS:
-            raise ValueError(f"material {material!r} is not supported; it is {OTHER_MATERIALS[material]}")
-        found = repr(material) if isinstance(material, str) else shape_of(material)
-        raise TypeError(f"material must be one of {[*USED, 'snow']} or a torch_mpm.Material, got {found}")
-    needed, optional = USED[material]
+    if isinstance(material, str):
+        if material in dialect.materials:
+            return dialect.materials[material]
+        if material in WITHOUT_LAW:
+            raise NotImplementedError(f"material {material!r} has no law: {WITHOUT_LAW[material]}")
+        others = [d for d in DIALECTS.values() if material in d.materials]
+        if others:
+            projects, names = (", ".join(getattr(d, name) for d in others) for name in ("project", "name"))
+            raise ValueError(f"material {material!r} is that of {projects}: pass dialect= of one of {names}")
+    found = repr(material) if isinstance(material, str) else shape_of(material)
+    raise TypeError(f"material must be one of {sorted(dialect.materials)} or a torch_mpm.Material, got {found}")
+
+
+def check_material(material: str, kind: str, parameters: Mapping[str, Any]) -> list[str]:
+    """Check that a material has all required parameters.
+
+    Returns:
+        Names of the parameters with an effect.
+
+    Raises:
+        ValueError: for a parameter that is missing, or out of the range of the material.
+    """
+    needed, optional = USED[kind]
     for name in needed:
         if name not in parameters:
-            words = f"{', '.join(needed[:-1])} and {needed[-1]}"
+            words = " and ".join([", ".join(needed[:-1]), needed[-1]]) if len(needed) > 1 else needed[0]
             raise ValueError(f"material {material!r} needs {words}: give {name} in set_parameters_dict")
     limit = parameters.get("yield_stress")
-    if material in ("metal", "plasticine") and bool((torch.as_tensor(limit).detach() <= 0).any()):
-        raise ValueError(f"yield_stress of {material!r} must be positive, got {limit}")
-    hardens = parameters.get("hardening", 0) == 1
-    effective = [name for name in (*needed, *optional) if name != "xi" or hardens]
-    check_gradients(parameters, effective, f"material {material!r}")
+    if "metal" in kind or kind == "plasticine":
+        if bool((torch.as_tensor(limit).detach() <= 0).any()):
+            raise ValueError(f"yield_stress of {material!r} must be positive, got {limit}")
+    effective = [name for name in (*needed, *optional) if name != "xi" or hardens(kind, parameters)]
+    return effective
+
+
+def hardens(kind: str, parameters: Mapping[str, Any]) -> bool:
+    """Whether a material hardens."""
+    return parameters.get("hardening", 0) == 1 or (kind in HARDENING_BY_ITS_KEY and "hardening" in parameters)
 
 
 def check_gradients(parameters: Mapping[str, Any], effective: Collection[str], material: str) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Mapping
 from typing import Any
@@ -10,32 +9,33 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ...boundaries import Obstacle
-from ...errors import check_count, check_like, check_number, shape_of
-from ...grid.grid import Grid
+from ...errors import check_count, check_flag, check_like, shape_of
 from ...laws import Material
-from ...rollouts import rollout
 from ...state.state import State, identity_deformation
-from ...step.particle_operations import Hold, Operations, Push, Timed
-from ...step.step import Step
-from ..gradients import Numbers, check_fixed, vector
-from ..keys import check_keys, check_needed, checked_list
-from ..node_conditions import FreezeOutside, NodeDamping, moving_cuboid, outer_planes, stopping_plane, surface_margin
-from ..selections import Rotation, in_box, in_cylinder
-from .exchange import Exchange
-from .materials import law_of
-from .parameters import BOX, BOX_UNSUPPORTED, KNOWN, UNSUPPORTED, WITHOUT_EFFECT, checked
-from .particles import DampedAffine, WithoutAffine, release_times
-from .surfaces import Cut
+from ..clipping import ClippedRollout
+from ..constitutive import lame
+from ..gradients import Numbers, check_fixed, refuse_grad, vector
+from ..keys import check_needed, checked_list
+from ..node_conditions import NodeDamping
+from ..selections import in_box
+from .dialects import (
+    PHYSGAUSSIAN,
+    WITHOUT_EFFECT,
+    Dialect,
+    check_parameter_keys,
+    code_of,
+    dialect_of,
+    recognised,
+    report,
+    warn_of_soft_solid,
+)
+from .law_choice import chosen_law
+from .parameters import BOX, check_box, checked
+from .substeps import Pending
+from .views import ModelView, ParticleView, Viewed
 
-PADDING = 3
-"""Nodes at each face of the domain on which a bounding box acts."""
-RESET_STEPS = 15
-"""Number of steps for which a cuboid with `reset` holds all nodes after its end."""
-FOREVER = 999.0
 
-
-class MPM_Simulator_WARP(Exchange):
+class MPM_Simulator_WARP(Viewed):
     """Explicit MPM on the cube [0, grid_lim]³ with forces by the gradient of quadratic B-splines and APIC.
 
     Substeps requested by `p2g2p` are computed together when something is read or changed, in one op where possible.
@@ -48,32 +48,61 @@ class MPM_Simulator_WARP(Exchange):
         n_grid: cells along each axis.
         grid_lim: edge of the domain [m].
         device: None for that of the data.
+        dialect: project whose units, keys, materials and defaults hold, see `DIALECTS`; None for PhysGaussian's, or
+            those of the first parameters that only another project has.
+        strict: whether nodes on the face of a surface or cuboid are compared in float32, as in PhysGaussian, so that
+            rounding decides; otherwise they are outside.
     """
 
     def __init__(
-        self, n_particles: int, n_grid: int = 100, grid_lim: float = 1.0, device: torch.device | str | None = None
+        self,
+        n_particles: int,
+        n_grid: int = 100,
+        grid_lim: float = 1.0,
+        device: torch.device | str | None = None,
+        *,
+        dialect: str | None = None,
+        strict: bool = False,
     ) -> None:
         check_count("n_particles", n_particles)
+        if dialect is not None:
+            _refuse_batches(dialect_of(dialect))
+        self._prepare(dialect, strict)
         self.initialize(n_particles, n_grid, grid_lim, device)
+
+    def _prepare(self, dialect: str | None, strict: bool) -> None:
+        """Set everything that `initialize` keeps."""
+        self._dialect: Dialect | None = None if dialect is None else dialect_of(dialect)
+        if self._dialect is not None:
+            report(self._dialect)
+        self.strict = check_flag("strict", strict)
+        self.time_profile: dict[str, list[float]] = {}
+        self.mpm_state, self.mpm_model = ParticleView(self), ModelView(self)
+
+    @property
+    def dialect(self) -> Dialect:  # type: ignore[override]
+        """Dialect of the parameters."""
+        return PHYSGAUSSIAN if self._dialect is None else self._dialect
 
     def initialize(
         self, n_particles: int, n_grid: int = 100, grid_lim: float = 1.0, device: torch.device | str | None = None
     ) -> None:
-        """Discard everything except the size of the grid."""
+        """Discard everything except the size of the grid and the dialect."""
         self.n_particles = n_particles
         size = {"n_grid": n_grid, "grid_lim": grid_lim}
         self.parameters: dict[str, Any] = {name: checked(name, value, torch.empty(0)) for name, value in size.items()}
         self._state: State | None = None
-        self._step: Step | None = None
+        self._step: ClippedRollout | None = None
         self._law: Material | None = None
+        self._anchored = None
         self._moduli: dict[str, Any] | None = None  # E and nu of the last finalize_mu_lam.
+        self._codes: Tensor | None = None
+        self._selections: dict[str, Tensor] = {}
         self._covariance: Tensor | None = None
+        self._exports: dict[str, Any] = {}
         self._damping: NodeDamping | None = None
-        self._nodes: list[Any] = []
-        self._acting: list[Any] = []
-        self._pushes: list[Any] = []
-        self._holds: list[Any] = []
-        self._queue: list[Any] = [0, 0.0, True]  # Substeps, dt, whether gradients are needed.
+        self._clear_conditions()
+        self._pending, self._versions = Pending(), {}
 
     # ---- data
 
@@ -97,26 +126,26 @@ class MPM_Simulator_WARP(Exchange):
         if not isinstance(tensor_x, Tensor) or tensor_x.dim() != 2 or tensor_x.shape[1] != 3:
             raise ValueError(f"tensor_x must have shape [P, 3], got {shape_of(tensor_x)}")
         self.initialize(len(tensor_x), n_grid, grid_lim)
-        x = tensor_x.to(device=device)
-        volume = tensor_volume.to(x)
+        self._place(tensor_x.to(device=device), tensor_volume, tensor_cov)
+
+    def _place(self, x: Tensor, volume: Tensor, cov: Tensor | None) -> None:
+        """Particles at rest at positions [P, 3] [m], with volumes [P] [m³]."""
+        volume = volume.to(x)
         check_like("tensor_volume", volume, x, (len(x),), "[P]")
         motion = torch.zeros(len(x), 3, 3, dtype=x.dtype, device=x.device)
         self._state = State(
             x=x, v=torch.zeros_like(x), mass=0 * volume, volume=volume, C=motion, F=identity_deformation(x)
         )
-        if tensor_cov is not None:
-            self._covariance = tensor_cov.to(x).reshape(-1, 6)
-            check_like("tensor_cov", self._covariance, x, (len(x), 6), "[P, 6]")
+        if cov is not None:
+            self.assign_covariance(cov)
 
     def load_from_sampling(
         self, sampling_h5: str, n_grid: int = 100, grid_lim: float = 1.0, device: torch.device | str | None = None
     ) -> None:
         """Particles at rest of an HDF5 file with x [3, P] and particle_volume [1, P] (needs h5py)."""
-        import h5py
+        self.load_initial_data_from_torch(*sampled(sampling_h5), None, n_grid, grid_lim, device)
 
-        with h5py.File(sampling_h5, "r") as file:
-            x, volume = (torch.as_tensor(file[name][()], dtype=torch.float32) for name in ("x", "particle_volume"))
-        self.load_initial_data_from_torch(x.T.contiguous(), volume.reshape(-1), None, n_grid, grid_lim, device)
+    # ---- parameters
 
     def set_parameters(self, device: torch.device | str | None = None, **kwargs: Any) -> None:
         """`set_parameters_dict` of keywords."""
@@ -128,45 +157,92 @@ class MPM_Simulator_WARP(Exchange):
         """Set material and numbers of the simulation; others are unchanged.
 
         Args:
-            kwargs: material ("jelly", "metal", "sand", "foam", "plasticine", or a `torch_mpm.Material`), E [Pa], nu,
-                density [kg/m³], yield_stress [Pa], xi, friction_angle [degrees], softening [Pa] and plastic_viscosity
-                [Pa s] (numbers, or tensors [] or [P]), rpic_damping and grid_v_damping_scale (numbers, or tensors []),
-                g (three numbers or a tensor [3] [m/s²]), hardening (1 for on), n_grid, grid_lim, and
-                additional_material_params: boxes with point, size, E, nu and density. All tensors but n_grid, grid_lim,
-                hardening, point and size may require grad. pic_damping and opacity_threshold have no effect.
+            kwargs: material ("jelly", "metal", "sand", "foam", "plasticine", another one of the dialect, or a
+                `torch_mpm.Material`), E [Pa], nu, density [kg/m³], yield_stress [Pa], xi, friction_angle [degrees],
+                softening [Pa] and plastic_viscosity [Pa s] (numbers, or tensors [] or [P]), rpic_damping and
+                grid_v_damping_scale (numbers, or tensors []), g (three numbers or a tensor [3] [m/s²]), hardening (1
+                for on), n_grid, grid_lim, and additional_material_params: boxes with point, size, E, nu and density.
+                Other keys and units are those of the dialect. All tensors but n_grid, grid_lim, hardening, point and
+                size may require grad. pic_damping and opacity_threshold have no effect.
 
         E and nu act from the next `finalize_mu_lam` on.
 
         Raises:
-            TypeError, ValueError: for an unknown key, a value of a wrong type, shape or range, or a gradient that a
-                value cannot have.
+            TypeError, ValueError: for an unknown key, a value of a wrong type, shape or range, a gradient that a value
+                cannot have, or keys of several dialects.
         """
         given = dict(kwargs or {})
         state = self._flushed()
-        check_keys("set_parameters_dict", given, (*KNOWN, *WITHOUT_EFFECT), UNSUPPORTED)
         extra = checked_list("additional_material_params", given.pop("additional_material_params", []))
-        self.parameters |= {name: checked(name, value, state.x) for name, value in given.items()}
+        self._recognise(given, extra, getattr(kwargs, "dialect", None))
+        check_parameter_keys(self.dialect, given)
+        unused = {name: given.pop(name) for name in (*self.dialect.without_effect, *WITHOUT_EFFECT) if name in given}
+        refuse_grad("it has no effect", **unused)
+        offset = given.pop("spawn_offset", None)
+        values = {name: checked(name, value, state.x) for name, value in given.items()}
+        for name, value in values.items():
+            warn_of_soft_solid(self.dialect, name, value)
+        if "material" in values:
+            self._codes, self._state = None, state.replace(material=None)
+        self.parameters |= values
         for box in extra:
-            self._set_in_box(state, box)
-        if extra or "density" in given:
-            self._state = state.replace(mass=self._of_particles("density", state) * state.volume)
-        if "yield_stress" in given and "yield_stress" in state.extra:
-            limit = self._of_particles("yield_stress", state)
-            self._state = self._loaded().replace(extra={**state.extra, "yield_stress": limit})
+            self._set_in_box(self._loaded(), box)
+        self._set_fields({*given, *(["density"] if extra else [])})
+        if offset is not None:
+            shift = vector("spawn_offset", offset, state.x)
+            self._state = self._loaded().replace(x=state.x + torch.as_tensor(shift).to(state.x))
         scale = self.parameters.get("grid_v_damping_scale", 1.0)
         damps = isinstance(scale, Tensor) or scale < 1
         self._damping, self._law, self._step = NodeDamping(scale) if damps else None, None, None
 
+    def _recognise(self, given: Mapping[str, Any], boxes: list[Any], of_configuration: Dialect | None) -> None:
+        """Choose the dialect by the first keys that PhysGaussian does not have, and report it."""
+        if of_configuration is not None and self._dialect not in (None, of_configuration):
+            raise ValueError(
+                f"dialect must be that of the configuration, {of_configuration.name!r}, got {self.dialect.name!r}"
+            )
+        found = of_configuration
+        if found is None and self._dialect is None:
+            found = recognised(given, given.get("material"), boxes={key for box in boxes for key in box})
+        if found is None or found is self._dialect:
+            return
+        _refuse_batches(found)
+        before = [name for name in found.units if name in self.parameters]
+        if before:
+            raise ValueError(
+                f"dialect must be given: {', '.join(before)} had been given in SI units, before keys of {found.project}"
+            )
+        signs = [key for key in given if key not in PHYSGAUSSIAN.known] or ["the configuration or material"]
+        self._dialect = found
+        report(found, signs)
+
+    def _set_fields(self, names: set[str]) -> None:
+        """Fields of the particles that follow from parameters."""
+        state = self._loaded()
+        if "density" in names:
+            self._state = state = state.replace(mass=self._of_particles("density", state) * state.volume)
+        history = {"yield_stress": "yield_stress", "alpha_0": "log_plastic_volume"}
+        for name, field in history.items():
+            if name in names and field in state.extra:
+                value = self.dialect.effective(name, self._of_particles(name, state))
+                self._state = state = state.replace(extra={**state.extra, field: value})
+
     def _set_in_box(self, state: State, box: Mapping[str, Any]) -> None:
-        """E, nu and density of the particles in a box."""
+        """E, nu, density and the material of the particles in a box."""
         what = "a box of additional_material_params"
-        check_keys(what, box, BOX, BOX_UNSUPPORTED)
+        check_box(what, box, self.dialect)
         check_needed(what, box, BOX)
         check_fixed("it selects particles", point=box["point"], size=box["size"])
         inside = in_box(state.x, box["point"], box["size"])
         for name in ("E", "nu", "density"):
             value = torch.as_tensor(checked(name, box[name], state.x), dtype=state.x.dtype, device=state.x.device)
             self.parameters[name] = torch.where(inside, value, self._of_particles(name, state))
+        if "material" in box:
+            given = box["material"]
+            if isinstance(given, str) and given not in self.dialect.materials:
+                raise ValueError(f"material of a box must be one of {sorted(self.dialect.materials)}, got {given!r}")
+            code = code_of(self.dialect, given) if isinstance(given, str) else int(given)
+            self.assign_material_codes(torch.where(inside, code, self.material_codes()))
 
     def _of_particles(self, name: str, state: State) -> Tensor:
         """A parameter [P]."""
@@ -183,7 +259,36 @@ class MPM_Simulator_WARP(Exchange):
         """
         self._flushed()
         self._moduli = {name: self.parameters[name] for name in ("E", "nu") if name in self.parameters}
-        self._law, self._step = law_of(self.parameters), None
+        self._law = self._step = None
+        chosen_law(self.dialect, self.parameters | self._moduli, self._codes)
+
+    def finalize_mu_lam_bulk(self, device: torch.device | str | None = None) -> None:
+        """`finalize_mu_lam`, and the bulk modulus of fluids from E and nu, in place of `bulk_modulus`.
+
+        Raises:
+            TypeError, ValueError: as `finalize_mu_lam`.
+        """
+        self._flushed()
+        if "bulk_modulus" in self.parameters and not self._bulk_follows:
+            warnings.warn(
+                "finalize_mu_lam_bulk sets the bulk modulus by E and nu, as in warp-mpm: bulk_modulus has no effect",
+                stacklevel=2,
+            )
+        self._bulk_follows = True
+        missing = [name for name in ("E", "nu") if name not in self.parameters]
+        if missing:
+            raise ValueError(f"finalize_mu_lam_bulk needs E and nu: give {missing[0]} in set_parameters_dict")
+        mu, lam = lame(self.dialect.si("E", self.parameters["E"]), self.parameters["nu"])
+        self.parameters["bulk_modulus"] = lam + 2 / 3 * mu
+        self.finalize_mu_lam()
+
+    _bulk_follows = False
+
+    def set_E_nu(self, E: float | Tensor, nu: float | Tensor, device: torch.device | str | None = None) -> None:
+        """E in units of the dialect, and nu: numbers, or tensors [] or [P], from the next `finalize_mu_lam` on."""
+        self.set_parameters_dict({"E": E, "nu": nu})
+
+    set_E_nu_from_torch = set_E_nu
 
     def reset_densities_and_update_masses(
         self, all_particle_densities: Tensor, device: torch.device | str | None = None
@@ -191,67 +296,7 @@ class MPM_Simulator_WARP(Exchange):
         """Density of each particle [P] [kg/m³]."""
         self.set_parameters_dict({"density": all_particle_densities})
 
-    # ---- what acts on nodes and particles
-
-    def add_surface_collider(
-        self,
-        point: Numbers,
-        normal: Numbers,
-        surface: str = "sticky",
-        friction: float = 0.0,
-        start_time: float = 0.0,
-        end_time: float = FOREVER,
-    ) -> None:
-        """Stop the nodes behind a plane, for any `surface`, as the original simulator does.
-
-        A surface that slips, separates or has friction is `add_boundary(torch_mpm.Plane(...))`. "cut" is specific to
-        that simulator, with fixed heights.
-        """
-        check_fixed("it selects nodes", point=point, normal=normal, start_time=start_time, end_time=end_time)
-        check_fixed("it has no effect", friction=friction)
-        if surface == "sticky" and friction != 0:
-            raise ValueError(f"friction must be 0 on sticky surfaces, got {friction}")
-        if surface == "cut":
-            self.add_boundary(Cut(point, normal, self._margin, start_time, end_time))
-            return
-        if surface != "sticky":
-            warnings.warn(
-                f"a surface collider stops the nodes behind it, as in PhysGaussian, also with surface={surface!r}: for "
-                "one that slips or separates call add_boundary(torch_mpm.Plane(point, normal, kind, friction))",
-                stacklevel=2,
-            )
-        self.add_boundary(stopping_plane(point, normal, self._margin, start_time, end_time))
-
-    def set_velocity_on_cuboid(
-        self,
-        point: Numbers,
-        size: Numbers,
-        velocity: Numbers,
-        start_time: float = 0.0,
-        end_time: float = FOREVER,
-        reset: int = 0,
-    ) -> None:
-        """Velocity of the nodes in a box of half edges `size`, which moves with it from `start_time` on.
-
-        With `reset` 1 all nodes of the grid are at rest before `start_time`, and for 15 steps after `end_time`.
-        """
-        check_fixed("it selects nodes", point=point, size=size, start_time=start_time, end_time=end_time)
-        moving = vector("velocity", velocity, self._flushed().x)
-        self.add_boundary(moving_cuboid(point, size, moving, self._margin, start_time, end_time))
-        if reset == 1:
-            self.add_boundary(FreezeOutside(start_time, end_time, RESET_STEPS))
-
-    def add_bounding_box(self, start_time: float = 0.0, end_time: float = FOREVER) -> None:
-        """Close the domain: no node within 3 of a face moves outwards."""
-        check_fixed("it selects nodes", start_time=start_time, end_time=end_time)
-        n, dx = self.parameters["n_grid"], self._dx
-        for plane in outer_planes((PADDING - 1) * dx, (n - PADDING) * dx, 3, start_time, end_time):
-            self.add_boundary(plane)
-
-    def add_boundary(self, boundary: Any) -> None:
-        """Append an object with the interface of `torch_mpm.boundaries`."""
-        self._flush()
-        self._nodes.append(boundary)
+    # ---- conditions on particles, selected by their present positions
 
     def add_impulse_on_particles(
         self,
@@ -264,11 +309,7 @@ class MPM_Simulator_WARP(Exchange):
         device: torch.device | str | None = None,
     ) -> None:
         """A force [N] on each particle that is now in a box of half edges `size`, for num_dt steps of dt."""
-        check_fixed("it selects particles", dt=dt, point=point, size=size, num_dt=num_dt, start_time=start_time)
-        x = self._flushed().x
-        inside = in_box(x, point, size)
-        self._pushes.append(Push(vector("force", force, x), start_time, start_time + dt * num_dt, inside))
-        self._step = None
+        self._impulse(self._flushed().x, force, dt, point, size, num_dt, start_time)
 
     def enforce_particle_velocity_translation(
         self,
@@ -280,9 +321,7 @@ class MPM_Simulator_WARP(Exchange):
         device: torch.device | str | None = None,
     ) -> None:
         """Velocity of the particles that are now in a box of half edges `size`."""
-        check_fixed("it selects particles", point=point, size=size, start_time=start_time, end_time=end_time)
-        x = self._flushed().x
-        self._hold(Hold(vector("velocity", velocity, x), start_time, end_time, in_box(x, point, size)))
+        self._translation(self._flushed().x, point, size, velocity, start_time, end_time)
 
     def enforce_particle_velocity_rotation(
         self,
@@ -298,12 +337,8 @@ class MPM_Simulator_WARP(Exchange):
         """Rotate the particles that are now in a cylinder about its axis, at −rotation_scale [rad/s] about `normal`,
         and move them along it at translation_scale [m/s].
         """
-        selecting = {"half_height_and_radius": half_height_and_radius, "start_time": start_time, "end_time": end_time}
-        check_fixed("it selects particles", **selecting)
-        x = self._flushed().x
-        point, normal = vector("point", point, x), vector("normal", normal, x)
-        inside = in_cylinder(x, point, normal, half_height_and_radius)
-        self._hold(Rotation(point, normal, rotation_scale, translation_scale, start_time, end_time, inside))
+        scales = rotation_scale, translation_scale
+        self._rotation(self._flushed().x, point, normal, half_height_and_radius, scales, start_time, end_time)
 
     def release_particles_sequentially(
         self,
@@ -315,108 +350,23 @@ class MPM_Simulator_WARP(Exchange):
         end_time: float,
     ) -> None:
         """Hold the particles between two positions on an axis at rest, and release them layer by layer, those at
-        `end_position` last. There are 50 layers, for any num_layers, as in the original simulator.
+        `end_position` last. There are 50 layers, for any num_layers, as in the original simulator; in PhysFlow and
+        MotionPhysics num_layers.
         """
-        times = {"start_time": start_time, "end_time": end_time, "num_layers": num_layers}
-        check_fixed(
-            "it selects particles", normal=normal, start_position=start_position, end_position=end_position, **times
-        )
-        x = self._flushed().x
-        self._hold(Hold((0.0, 0.0, 0.0), start_time, release_times(x, normal, start_position, end_position, end_time)))
-
-    def _hold(self, operation: Any) -> None:
-        self._holds.append(operation)
-        self._step = None
-
-    # ---- time
-
-    @property
-    def time(self) -> float:
-        """[s]"""
-        steps, dt, _ = self._queue
-        return self._start_time + steps * dt
-
-    @property
-    def _start_time(self) -> float:
-        return 0.0 if self._state is None else float(self._state.time)
-
-    def p2g2p(self, step: int, dt: float, device: torch.device | str | None = None) -> None:
-        """A substep of dt [s]; `step` is not used."""
-        check_number("dt", dt, "positive", lambda v: v > 0)
-        grad = torch.is_grad_enabled()
-        if self._queue[1:] != [dt, grad]:
-            self._flush()
-            self._check_ready()
-            self._queue[1:] = [dt, grad]
-        self._queue[0] += 1
-
-    def _check_ready(self) -> None:
-        self._loaded()
-        if self._moduli is None:
-            raise ValueError("the material is not known: call set_parameters_dict and finalize_mu_lam before p2g2p")
-        if self._law is None:
-            self._law = law_of(self.parameters | self._moduli)
-        if "density" not in self.parameters:
-            raise ValueError("the particles have no mass: give density in set_parameters_dict")
-
-    def _flush(self) -> None:
-        """Compute the pending substeps."""
-        (steps, dt, grad), self._queue = self._queue, [0, 0.0, True]
-        if steps == 0:
-            return
-        with torch.set_grad_enabled(grad):
-            first = self._start_time
-            step = self._ready_step(first, first + (steps - 1) * dt, dt)
-            self._state = rollout(step, self._loaded(), steps, dt)
-
-    @property
-    def step(self) -> Step:
-        """Step of torch_mpm of the substeps; `simulator.step.check()` reports errors."""
-        self._flushed()
-        self._check_ready()
-        return self._ready_step(self._start_time, math.inf, 0.0)
-
-    def _ready_step(self, first: float, last: float, dt: float) -> Step:
-        """Step with the conditions that are active at times from `first` to `last`."""
-        acting = [b for b in self._nodes if _acts(b, first, last, dt)]
-        if self._damping is not None:
-            acting.insert(0, self._damping)
-        if self._step is None:
-            self._step, self._acting = self._made_step(), []
-        if acting != self._acting:
-            self._step.boundaries = self._acting = acting  # type: ignore[assignment]
-        return self._step
-
-    def _made_step(self) -> Step:
-        assert self._law is not None
-        operations = [*self._pushes, *self._holds, *_affine(self.parameters.get("rpic_damping", 0.0))]
-        return Step(
-            Grid(self._dx, (0.0,) * 3, (float(self.parameters["grid_lim"]),) * 3),
-            self._law,
-            gravity=self.parameters.get("g"),
-            stress_form="gradient",
-            on_particles=Operations(operations) if operations else None,
-        )
-
-    @property
-    def _margin(self) -> float:
-        return surface_margin(self._loaded().x.dtype, float(self.parameters["grid_lim"]))
-
-    @property
-    def _dx(self) -> float:
-        return float(self.parameters["grid_lim"]) / int(self.parameters["n_grid"])
+        layers = num_layers, num_layers if self.dialect.layers is None else self.dialect.layers
+        self._release(self._flushed().x, normal, (start_position, end_position), layers, start_time, end_time)
 
 
-def _affine(damping: float | Tensor) -> list[Timed]:
-    """Operation of `rpic_damping` on C."""
-    if isinstance(damping, Tensor) and damping.requires_grad:
-        return [DampedAffine(damping)]
-    share = float(damping)
-    return [] if share == 0 else [WithoutAffine() if share < 0 else DampedAffine(share)]
+def _refuse_batches(dialect: Dialect) -> None:
+    """Refuse the dialect whose simulator has batches."""
+    if dialect.name == "kywind":
+        raise ValueError("dialect must not be 'kywind', whose dx and batches need BatchedSimulator(batch_size=, dx=)")
 
 
-def _acts(boundary: Any, first: float, last: float, dt: float) -> bool:
-    """Whether a condition on the nodes is active at a time from `first` to `last`."""
-    if isinstance(boundary, Obstacle):
-        return boundary.start <= last and first < boundary.end
-    return boundary.acts_within(first, last, dt) if isinstance(boundary, FreezeOutside) else True
+def sampled(file_h5: str) -> tuple[Tensor, Tensor]:
+    """Positions [P, 3] [m] and volumes [P] [m³] of an HDF5 file, float32."""
+    import h5py
+
+    with h5py.File(file_h5, "r") as file:
+        x, volume = (torch.as_tensor(file[name][()], dtype=torch.float32) for name in ("x", "particle_volume"))
+    return x.T.contiguous(), volume.reshape(-1)

@@ -18,6 +18,7 @@ class Cut(nn.Module):
 
     def __init__(self, point: Numbers, normal: Numbers, margin: float, start: float, end: float) -> None:
         super().__init__()
+        self.start, self.end = float(start), float(end)
         self.plane = stopping_plane(point, normal, margin, start, end)
 
     def forward(self, velocity: Tensor, positions: Tensor, scene: Tensor | None, time: float, dt: float) -> Tensor:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from .. import constitutive
-from ..gradients import number, refuse_grad
+from ... import constitutive
+from ...gradients import number, refuse_grad
 
 __all__ = [
     "CorotatedElasticity",
