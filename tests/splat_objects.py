@@ -1,6 +1,4 @@
-"""Gaussians for tests: random ones, and shells of a sphere and of a torus."""
-
-import math
+"""Random Gaussians, rotations, and a camera for tests."""
 
 import numpy as np
 import torch
@@ -19,33 +17,6 @@ def random_gaussians(
     opacity = 0.05 + 0.9 * torch.rand(count, dtype=dtype, generator=generator)
     harmonics = 0.3 * torch.randn(count, (degree + 1) ** 2, 3, dtype=dtype, generator=generator)
     return splats.Gaussians.from_factors(x, size * (0.3 + widths), turns - 0.5, opacity, harmonics)
-
-
-def shell(x: Tensor, normals: Tensor, spacing: float) -> splats.Gaussians:
-    """Flat opaque Gaussians on a surface."""
-    across = torch.eye(3, dtype=x.dtype)[normals.abs().argmin(1)]
-    first = torch.nn.functional.normalize(torch.linalg.cross(normals, across), dim=1)
-    second = torch.linalg.cross(normals, first)
-    axes = spacing * torch.stack([first, second, 0.1 * normals], 2)
-    return splats.Gaussians(x, axes, torch.full_like(x[:, 0], 3.0), 0.5 * torch.ones(len(x), 1, 3, dtype=x.dtype))
-
-
-def sphere(radius: float, center: tuple[float, float, float], count: int) -> splats.Gaussians:
-    k = torch.arange(count, dtype=torch.float64)
-    z, angle = 1 - 2 * (k + 0.5) / count, k * math.pi * (3 - math.sqrt(5))
-    r = (1 - z * z).sqrt()
-    normals = torch.stack([r * angle.cos(), r * angle.sin(), z], 1)
-    x = torch.tensor(center, dtype=torch.float64) + radius * normals
-    return shell(x, normals, radius * math.sqrt(4 * math.pi / count))
-
-
-def torus(major: float, minor: float, count: int) -> splats.Gaussians:
-    """Around the y axis."""
-    k = torch.arange(count, dtype=torch.float64)
-    a, b = (2 * math.pi * (k * step % 1) for step in (0.7548776662466927, 0.5698402909980532))
-    ring = torch.stack([a.cos(), 0 * a, a.sin()], 1)
-    normals = b.cos()[:, None] * ring + b.sin()[:, None] * torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
-    return shell(major * ring + minor * normals, normals, math.sqrt(4 * math.pi**2 * major * minor / count))
 
 
 def unit_cube_camera(width: int, height: int) -> Camera:

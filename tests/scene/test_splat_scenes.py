@@ -5,11 +5,12 @@ import json
 import numpy as np
 import pytest
 import torch
-from splat_objects import random_gaussians, sphere
+from splat_objects import random_gaussians
 
 pytest.importorskip("pydantic")
 pytest.importorskip("h5py")
 
+from benchmarks.catalogue.splats import sphere
 from torch_mpm import Trajectory, splats
 from torch_mpm.cli import main
 from torch_mpm.scene import Scene, splat_bodies, splat_frames

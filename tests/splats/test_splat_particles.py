@@ -4,9 +4,10 @@ import math
 
 import pytest
 import torch
-from splat_objects import random_gaussians, sphere, torus
+from splat_objects import random_gaussians
 
 import torch_mpm as mpm
+from benchmarks.catalogue.splats import sphere, torus
 from torch_mpm import splats
 
 DX = 1 / 32

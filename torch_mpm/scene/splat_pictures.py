@@ -31,10 +31,10 @@ from .scene import Scene
 from .splat_bodies import up_axis
 from .splat_frames import Progress, SplatFrames
 
-SAMPLES = 20_000
+SAMPLES = 60_000
 """Number of Gaussians on the surface of an obstacle."""
-THINNESS = 0.1
-"""Deviation of such a Gaussian across the surface, relative to that along it."""
+WIDTH, THINNESS = 0.6, 0.06
+"""Deviations of such a Gaussian along and across the surface, relative to the distance of its neighbours."""
 SOLID = 0.98
 """Opacity of the Gaussians of obstacles that are opaque, and of particles."""
 
@@ -154,7 +154,7 @@ def flat(samples: Samples, color: Array, opacity: float, like: torch.Tensor) -> 
     across = torch.eye(3, dtype=like.dtype)[normals.abs().argmin(1)]
     first = torch.nn.functional.normalize(torch.linalg.cross(normals, across), dim=1)
     second = torch.linalg.cross(normals, first)
-    axes = samples.radius * torch.stack([first, second, THINNESS * normals], 2)
+    axes = samples.radius * torch.stack([WIDTH * first, WIDTH * second, THINNESS * normals], 2)
     return solid(torch.from_numpy(samples.points).to(like), axes, torch.from_numpy(color).to(like), opacity)
 
 
