@@ -89,14 +89,17 @@ def test_files_of_the_frames(material, up, folder):
 
 
 def test_coordinates_relative_to_an_origin(folder):
-    """Files and trajectory are in the coordinates of the scene file."""
+    """As files in float32 cannot hold coordinates of a map; the trajectory is in those of the scene file."""
     body = {key: value for key, value in OBJECT.items() if key not in ("extent", "center", "velocity")}
     grid = {"lower": (2, 3, 4), "upper": (4, 5, 6), "dx": 0.125}
     scene = Scene.from_words(words(body=[body], grid=grid, origin=(3, 4, 5)), folder=folder)
     assert float(scene.build("cpu").state.x.abs().max()) < 0.6
     scene.run(folder / "out")
     first = splats.read(splat_frames.write_frames(folder / "out", scene)[0])
-    torch.testing.assert_close(first.x, splats.read(folder / "ball.ply").x[:600], rtol=0, atol=1e-6)
+    expected = splats.read(folder / "ball.ply").x[:600] - torch.tensor([3.0, 4.0, 5.0])
+    torch.testing.assert_close(first.x, expected, rtol=0, atol=1e-6)
+    with Trajectory(folder / "out") as trajectory:
+        assert trajectory["position"].min() > 2
 
 
 def test_a_full_disk_is_known_before(folder, monkeypatch):
@@ -152,6 +155,7 @@ duration = 0.03
 fps = 100
 grid = {{ lower = [0, 0, 0], upper = [1, 1, 1], dx = 0.0625 }}
 material.jelly = {{ law = "neo_hookean", E = 1e4 }}
+material.water = {{ law = "weakly_compressible", bulk_modulus = 1e4 }}
 render = {{ resolution = [64, 48] }}
 [[body]]
 shape = "{shape}"
@@ -168,6 +172,11 @@ material = "jelly"
 shape = "sphere"
 center = [0.5, 0.0, 0.5]
 radius = 0.2
+[[emitter]]
+center = [0.2, 0.9, 0.2]
+radius = 0.08
+velocity = [0, -2, 0]
+material = "water"
 """
 
 

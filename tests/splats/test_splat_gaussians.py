@@ -128,6 +128,9 @@ def test_gaussians_follow_their_particles_in_any_order():
     fluid = splats.moved(before, state.replace(F=None, J=8 * ones))
     torch.testing.assert_close(fluid.covariance, 4 * before.covariance)
     torch.testing.assert_close(fluid.harmonics, before.harmonics)
+    for ids in (order + 1, torch.zeros_like(order)):
+        with pytest.raises(ValueError, match="ids of the state must be 0 to 13 in some order"):
+            splats.moved(before, mixed.replace(ids=ids))
     with pytest.raises(ValueError, match="state must have a particle for each Gaussian, 15, got 14"):
         splats.moved(before, state, first=5)
 

@@ -93,6 +93,7 @@ def test_enclosed_cells():
     [
         ({"grid": 1e-7}, "cells of 5e-08 m, which take .* are free; remove distant Gaussians"),
         ({"grid": 0.0}, "the grid's dx must be positive"),
+        ({"grid": mpm.Grid(DX, (0, 0), (1, 1))}, "grid must have 3 dimensions for Gaussians, got 2"),
         ({"per_cell": -1}, "per_cell must be positive"),
         ({"method": "random"}, "method must be"),
     ],

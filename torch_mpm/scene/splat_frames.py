@@ -28,7 +28,7 @@ Progress = Callable[[int, int], None]
 
 
 class SplatFrames:
-    """Gaussians of the bodies of a run in its frames, in the coordinates of the scene file, on the CPU.
+    """Gaussians of the bodies of a run in its frames, relative to the origin of the scene, on the CPU.
 
     Raises:
         SceneError: for a scene without splats, or a batch of scenes.
@@ -38,6 +38,7 @@ class SplatFrames:
 
     def __init__(self, scene: Scene, trajectory: Trajectory) -> None:
         check_scene(scene)
+        self._origin = scene.origin
         (entry,) = scene.entries()
         bodies = [body for body in entry.body if isinstance(body, schema.SplatsBody)]
         self.rest = concatenate([splat_bodies.loaded(scene, entry, body) for body in bodies])
@@ -56,7 +57,7 @@ class SplatFrames:
 
     def of(self, frame: dict[str, Array]) -> Gaussians:
         """Deformed Gaussians of a frame of the trajectory."""
-        x = self._values(frame, "position")
+        x = torch.from_numpy(self.positions(frame, self.rows)).to(self.rest.x.dtype)
         moved = deformation(x, None, None)
         if "F" in frame:
             moved = torch.where(self._fluid[:, None, None], moved, self._values(frame, "F"))
@@ -64,6 +65,11 @@ class SplatFrames:
             fluid = deformation(x, None, self._values(frame, "J"))
             moved = torch.where(self._fluid[:, None, None], fluid, moved)
         return deformed(self.rest, x, moved)
+
+    def positions(self, frame: dict[str, Array], rows: Array) -> Array:
+        """Positions of some particles [n, 3] [m], relative to the origin."""
+        x: Array = frame["position"][rows]
+        return x if self._origin is None else x - np.array(self._origin)
 
     def _values(self, frame: dict[str, Array], name: str) -> torch.Tensor:
         return torch.from_numpy(frame[name][self.rows]).to(self.rest.x.dtype)

@@ -9,14 +9,11 @@ import numpy as np
 import torch
 
 from ..data.trajectory import Array, Trajectory
-from ..data.whole_files import output_folder, output_path, remove_leftovers
-from ..render import assemble_video, obstacle_shapes, write_png
+from ..render import obstacle_shapes
 from ..render.annotate import write_text
 from ..render.camera import framing, light_directions
-from ..render.cloud import rest_spacing
 from ..render.colors import palette_colors
 from ..render.ground import Ground
-from ..render.images import note_of
 from ..render.shapes import Samples, surface_samples
 from ..render.software import SoftwareScene, lit
 from ..splats import Gaussians, concatenate, render
@@ -25,14 +22,14 @@ from ..splats.picture import chosen_backend
 from ..splats.placement import axis
 from . import check, schema
 from .explain import SceneError
-from .pictures import FOLDER, VIDEO
+from .pictures import draw_by
 from .places import obstacle
 from .scene import Scene
 from .splat_bodies import up_axis
 from .splat_frames import Progress, SplatFrames
 
-SAMPLES = 60_000
-"""Number of Gaussians on the surface of an obstacle."""
+PIXELS, SAMPLES = 6, (2000, 60_000)
+"""Pixels of a picture for each Gaussian on the surface of an obstacle, and the range of the number of these."""
 WIDTH, THINNESS = 0.6, 0.06
 """Deviations of such a Gaussian along and across the surface, relative to the distance of its neighbours."""
 SOLID = 0.98
@@ -66,48 +63,35 @@ def draw_frames(
         DamagedFileError, OSError, ValueError: as `SplatFrames`.
         ImportError: when a package of the extra ``render`` is missing, or gsplat where it is wanted.
     """
-    words = scene.render or schema.Render()
     if problems := list(check.render_problems(scene)):
         raise SceneError(problems, scene.source)
-    target, video = (output_path(Path(folder), name) for name in (FOLDER, VIDEO))
-    remove_leftovers(Path(folder))
-    with Trajectory(folder) as trajectory, output_folder(target):
-        artist = _Artist(scene, words, trajectory, backend, device or torch.device("cpu"))
-        numbers = range(0, len(trajectory), words.every)
-        paths = [target / f"{k:05d}.png" for k in numbers]
-        for k, path in zip(numbers, paths, strict=True):
-            if note_of(path) != artist.way:
-                write_png(path, artist.picture(trajectory.frame(k)), note=artist.way)
-            if progress is not None:
-                progress(k, len(trajectory))
-    if not words.video:
-        return paths
-    assemble_video(paths, video, scene.frames / scene.duration / words.every)
-    return [*paths, video]
+
+    def artist(trajectory: Trajectory) -> _Artist:
+        return _Artist(scene, trajectory, backend, device or torch.device("cpu"))
+
+    return draw_by(artist, folder, scene, progress)
 
 
 class _Artist:
     """Camera, ground and bodies of a run."""
 
-    def __init__(
-        self, scene: Scene, words: schema.Render, trajectory: Trajectory, backend: str, device: torch.device
-    ) -> None:
-        self.scene, self.device, self.backend = scene, device, backend
+    def __init__(self, scene: Scene, trajectory: Trajectory, backend: str, device: torch.device) -> None:
         self.frames = SplatFrames(scene, trajectory)
-        lower, upper = (np.array(corner, dtype=np.float64) for corner in (scene.grid.lower, scene.grid.upper))
-        corners = words.view or (scene.grid.lower, scene.grid.upper)
+        self.device, self.backend, self.scene = device, backend, scene.relative()
+        words, grid = self.scene.render or schema.Render(), self.scene.grid
+        lower, upper = (np.array(corner, dtype=np.float64) for corner in (grid.lower, grid.upper))
+        low, high = (np.array(corner, dtype=np.float64) for corner in words.view or (grid.lower, grid.upper))
         up = axis(up_axis(scene.gravity)).numpy()
-        width, height = words.resolution
-        low, high = (np.array(corner, dtype=np.float64) for corner in corners)
-        self.camera = framing(low, high, up, (width, height), words.azimuth, words.elevation, fill=(0.92, 0.86))
+        pixels = words.resolution[0] * words.resolution[1]
+        self.samples = min(max(pixels // PIXELS, SAMPLES[0]), SAMPLES[1])
+        self.camera = framing(low, high, up, words.resolution, words.azimuth, words.elevation, fill=(0.92, 0.86))
         ground = Ground(lower, upper, up, -light_directions(self.camera)[0])
         self.stage = SoftwareScene(self.camera, ground, (lower, upper))
-        first = trajectory.frame(0)["position"]
-        others = self.frames.others
-        self.radius = 0.5 * rest_spacing(first[others[others < len(first)]].astype(np.float64))
+        volumes = trajectory["volume"][self.frames.others]
+        self.radius = 0.5 * float(np.cbrt(volumes.mean())) if len(volumes) else 0.0
+        """Deviation of the Gaussians of other particles [m]."""
         drawn = "splats", chosen_backend(self.frames.rest.to(device)) if backend == "auto" else backend
         self.way = hashlib.sha256(repr((scene.model_dump_json(), drawn)).encode()).hexdigest()
-        """Hash of everything that affects the picture of a frame."""
 
     def picture(self, frame: dict[str, Array]) -> Array:
         """One frame, uint8 [H, W, 3]."""
@@ -125,12 +109,15 @@ class _Artist:
         image = write_text(image, f"t = {float(frame['time']):.3f} s", "bottom left")
         return write_text(image, self.scene.title, "top left", 1.25) if self.scene.title else image
 
+    def close(self) -> None:
+        """Nothing to release."""
+
     def _obstacles(self, time: float) -> tuple[list[Samples], list[Gaussians]]:
         """Samples of the surfaces of the obstacles at a time [s], and Gaussians on them."""
         samples, bodies = [], []
         for words in self.scene.obstacle:
             for shape in obstacle_shapes(obstacle(words, None), time, (self.scene.grid.lower, self.scene.grid.upper)):
-                found = surface_samples(shape, SAMPLES)
+                found = surface_samples(shape, self.samples)
                 color = lit(np.array(shape.color), found.normals, self.camera)
                 samples.append(found)
                 bodies.append(flat(found, color, SOLID * words.opacity, self.frames.rest.x))
@@ -139,7 +126,7 @@ class _Artist:
     def _others(self, frame: dict[str, Array]) -> tuple[list[Gaussians], Array]:
         """Gaussians at the particles of other bodies, and the positions of these [n, 3]."""
         rows = self.frames.others[self.frames.others < len(frame["position"])]
-        x = frame["position"][rows]
+        x = self.frames.positions(frame, rows)
         if len(rows) == 0:
             return [], x
         like = self.frames.rest.x

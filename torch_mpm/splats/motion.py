@@ -46,7 +46,8 @@ def moved(gaussians: Gaussians, state: State, first: int = 0) -> Gaussians:
     Gradients pass to the state.
 
     Raises:
-        ValueError, TypeError: for a state of fewer particles, or of another dtype or device.
+        ValueError, TypeError: for a state of fewer particles or with other ids than 0 to P − 1, or of another dtype or
+            device.
     """
     check_count("first", first)
     N, P = len(gaussians), len(state)
@@ -54,8 +55,10 @@ def moved(gaussians: Gaussians, state: State, first: int = 0) -> Gaussians:
         raise ValueError(f"state must have a particle for each Gaussian, {first + N}, got {P}")
     rows: Tensor | slice = slice(first, first + N)
     if state.ids is not None:
-        places = torch.arange(P, device=state.x.device)
-        rows = torch.empty_like(places).scatter_(0, state.ids, places)[rows]
+        order = state.ids.argsort()
+        if not torch.equal(state.ids[order], torch.arange(P, device=order.device)):
+            raise ValueError(f"ids of the state must be 0 to {P - 1} in some order")
+        rows = order[rows]
     x = state.x[rows]
     F = deformation(x, None if state.F is None else state.F[rows], None if state.J is None else state.J[rows])
     return deformed(gaussians, x, F)

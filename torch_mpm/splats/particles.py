@@ -49,17 +49,14 @@ def particles(
     On a lattice of cubes h = dx / per_cell^(1/3) around the object, cells with an opacity field of at least 0.5 are
     opaque, and cells from which all six rays along the axes meet another opaque cell are enclosed. Enclosed cells
     without the centre of a Gaussian are filled, except opaque ones that touch the outside. The n Gaussians in a cell
-    share its volume, h³/n each; the filling particles share that of the filled cells. So the cells at the surface count
-    as full.
+    share its volume, h³/n each; the filling particles share that of the filled cells.
 
     Args:
         gaussians: the object in the coordinates of the domain [m].
         grid: a grid in 3-D, or its node spacing dx [m].
         per_cell: mean number of filling particles in a cell of volume dx³.
         fill: False for the Gaussians alone, for thin shells.
-        method: "lattice", "jittered" or "poisson", as for `torch_mpm.seed.fill`.
-        seed: seed of the random numbers.
-        origin, dtype, device: as for `torch_mpm.seed.fill`.
+        method, seed, origin, dtype, device: as for `torch_mpm.seed.fill`.
 
     Returns:
         Points, with the number of their Gaussian in `fields["gaussian"]`, int64 [P], or −1.
@@ -70,18 +67,21 @@ def particles(
     check_flag("fill", fill)
     if len(gaussians) == 0:
         raise ValueError("an object needs at least one Gaussian, got none")
+    if (dim := getattr(grid, "dim", 3)) != 3:
+        raise ValueError(f"grid must have 3 dimensions for Gaussians, got {dim}")
     dx = check_number("the grid's dx", getattr(grid, "dx", grid), "positive", lambda v: 0 < v < math.inf)
     per_cell = check_number("per_cell", per_cell, "positive", lambda v: 0 < v < math.inf)
     with on_host(), torch.no_grad():
         host = gaussians.to("cpu")
         lattice = Lattice(host.x, float(dx / per_cell ** (1 / 3)))
-        x, volume = [host.x.double()], [_shares(host.x, lattice)]
+        parts = [Points(host.x.double(), _shares(host.x, lattice))]
         if fill and (region := Interior(host, lattice)).volume > 0:
-            inner = seeding.fill(region, dx, per_cell, method=method, seed=seed, dtype=torch.float64)  # type: ignore[arg-type]
-            x, volume = [*x, inner.x], [*volume, inner.volume]
-        number = torch.full((sum(map(len, x)),), -1)
-        number[: len(host)] = torch.arange(len(host))
-    points = seeding._points(torch.cat(x), torch.cat(volume), origin, dtype, device)
+            options: dict[str, Any] = {"method": method, "seed": seed, "dtype": torch.float64}
+            parts.append(seeding.fill(region, dx, per_cell, **options))  # type: ignore[arg-type]
+        x, volume = torch.cat([part.x for part in parts]), torch.cat([part.volume for part in parts])
+        number = torch.arange(len(x))
+        number[len(host) :] = -1
+    points = seeding._points(x, volume, origin, dtype, device)
     return dataclasses.replace(points, fields={FIELD: number.to(points.x.device)})
 
 
