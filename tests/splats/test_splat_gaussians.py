@@ -174,3 +174,13 @@ def test_wrong_shapes_are_named(changes, message):
 def test_wrong_placements_are_named(options, message):
     with pytest.raises(ValueError, match=message):
         splats.placed(random_gaussians(3), **options)
+
+
+@pytest.mark.parametrize(("far", "message"), [(0.0, "got 0 m"), (3e38, "got inf m")])
+def test_centres_without_an_extent_are_an_error(far, message):
+    made = random_gaussians(2, 0, torch.float32)
+    made = made.replace(x=torch.tensor([[0.0, -far, 0.0], [0.0, far, 0.0]]))
+    with pytest.raises(
+        ValueError, match="extent of the centres of the Gaussians must be positive and finite, " + message
+    ):
+        splats.placed(made, extent=1.0)

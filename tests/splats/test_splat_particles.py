@@ -111,6 +111,16 @@ def test_too_many_large_gaussians_are_refused():
         splats.particles(large, 0.015)
 
 
+def test_gaussians_larger_than_all_numbers_of_cells():
+    """One of 1e8 m reaches over the whole lattice, whose cells it makes opaque."""
+    ball = sphere(0.2, (0.0, 0.0, 0.0), 3000)
+    huge = random_gaussians(1, 0).replace(x=ball.x[:1], axes=1e8 * torch.eye(3, dtype=torch.float64)[None])
+    huge = huge.replace(opacity_logit=torch.tensor([3.0], dtype=torch.float64))
+    both = splats.concatenate([ball, huge])
+    lattice = splats.Lattice(both.x, DX / 2)
+    assert float(splats.opacity_field(both, lattice).min()) > 0.9
+
+
 def test_no_gaussians_are_an_error():
     nothing = random_gaussians(3)[:0]
     for call in (lambda: splats.particles(nothing, DX), lambda: splats.placed(nothing)):

@@ -67,6 +67,19 @@ def test_gaussians_beside_and_behind_the_camera():
     np.testing.assert_allclose(splats.render(gaussians, camera).color.numpy(), color, atol=3e-4)
 
 
+def test_long_and_thin_gaussians_in_single_precision():
+    """Needles of 1e5 deviations of their width, and of 1e4 m, in float32."""
+    made = random_gaussians(60, degree=0)
+    scale = torch.tensor([[1e-5, 1e-5, 1.0], [1e-4, 1.0, 1e4]], dtype=torch.float64).repeat(30, 1)
+    turn = torch.randn(60, 4, dtype=torch.float64)
+    needles = splats.Gaussians.from_factors(made.x, scale, turn, 0.2 * made.opacity, made.harmonics)
+    camera = unit_cube_camera(40, 30)
+    expected, _ = reference(needles, camera, np.ones(3))
+    found = splats.render(needles.to(dtype=torch.float32), camera).color
+    np.testing.assert_allclose(found.numpy(), expected, atol=2e-3)
+    assert np.ptp(expected) > 0.1
+
+
 def test_no_gaussians_are_the_background():
     nothing = random_gaussians(3)[:0]
     found = splats.render(nothing, unit_cube_camera(20, 17), (0.1, 0.2, 0.3))

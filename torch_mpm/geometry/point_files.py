@@ -286,7 +286,8 @@ def _read_ply(path: Path, dim: int | None) -> PointFile:
             fields = {name: rows[name].astype(rows[name].dtype.newbyteorder("=")) for name in names}
     if len(fields["x"]) != count:
         raise ValueError(f"it has {len(fields['x'])} of its {count} vertices")
-    x = np.stack([fields.pop(axis).astype(np.float64) for axis in "xyz"], 1)
+    with np.errstate(invalid="ignore"):  # For NaN of all kinds.
+        x = np.stack([fields.pop(axis).astype(np.float64) for axis in "xyz"], 1)
     volume = fields.pop("volume", None)
     return PointFile(x, None if volume is None else volume.astype(np.float64), fields)
 

@@ -50,8 +50,8 @@ class Lattice:
 
     def cells(self, x: Tensor) -> Tensor:
         """Cells [N, 3], int64, of points [N, 3] in the box; those beyond it count as the outermost cells."""
-        index = ((x.double() - self.lower) / self.spacing).floor().long()
-        return index.clamp(min=0).minimum(torch.tensor(self.shape) - 1)
+        index = ((x.double() - self.lower) / self.spacing).floor().clamp(min=0)
+        return index.minimum(torch.tensor(self.shape, dtype=index.dtype) - 1).long()
 
     def numbers(self, cells: Tensor) -> Tensor:
         """Numbers [N] of cells [N, 3] in arrays of the shape of the lattice."""

@@ -44,8 +44,10 @@ def placed(
     x, axes = x @ rotation.T, rotation @ gaussians.axes
     if extent is not None:
         longest = float((x.amax(0) - x.amin(0)).max())
-        if longest == 0:
-            raise ValueError("the centres of the Gaussians are all at one point, which has no extent")
+        if not 0 < longest < math.inf:
+            raise ValueError(
+                f"the extent of the centres of the Gaussians must be positive and finite, got {longest:g} m"
+            )
         factor = check_number("extent", extent, "positive", lambda v: 0 < v < math.inf) / longest
         x, axes = factor * x, factor * axes
     if center is not None:

@@ -23,8 +23,8 @@ NEEDED = (*COLOR, "opacity", *SCALE, *ROTATION)
 """Properties without which a file has no Gaussians, beside x, y and z."""
 REST = tuple(3 * (count - 1) for count in COUNTS)
 """Number of the properties f_rest_0, f_rest_1, ... for the degrees 0 to 3."""
-LARGEST_LOG = 40.0
-"""Largest absolute value of the logarithm of a deviation; the square of its exponential is finite in float32."""
+SMALLEST_LOG, LARGEST_LOG = -40.0, 20.0
+"""Range of the logarithms of deviations, for which squares in a picture neither vanish nor overflow in float32."""
 
 
 def read(path: str | Path, dtype: torch.dtype = torch.float32) -> Gaussians:
@@ -68,7 +68,8 @@ def _gaussians(x: Array, fields: dict[str, Array], dtype: torch.dtype) -> Gaussi
         return torch.from_numpy(np.stack([fields[name] for name in chosen], 1)).to(dtype)
 
     scale, quaternion = columns(SCALE), columns(ROTATION)
-    _check_rows(scale.abs().amax(1) > LARGEST_LOG, f"a scale beyond ±{LARGEST_LOG:g}, the logarithm of a deviation")
+    wrong = (scale < SMALLEST_LOG) | (scale > LARGEST_LOG)
+    _check_rows(wrong.any(1), f"a scale, the logarithm of a deviation, outside {SMALLEST_LOG:g} to {LARGEST_LOG:g}")
     _check_rows(quaternion.norm(dim=1) < 1e-12, "a quaternion rot_0, ..., rot_3 of zeros")
     harmonics = columns(COLOR)[:, None, :]
     if rest:
@@ -141,7 +142,7 @@ def table_of(gaussians: Gaussians) -> np.ndarray[Any, np.dtype[np.float32]]:
         gaussians.harmonics[:, 0],
         gaussians.harmonics[:, 1:].mT.flatten(1),
         gaussians.opacity_logit[:, None],
-        scale.log().clamp(min=-LARGEST_LOG),
+        scale.log().clamp(min=SMALLEST_LOG),
         quaternion,
     ]
     table = torch.cat([column.detach().to(torch.float32).cpu() for column in columns], 1)

@@ -54,6 +54,21 @@ class View(NamedTuple):
         return cls(rotation, like.new_tensor(camera.position.tolist()), focal)
 
 
+def _inverse(half_axes: Tensor) -> tuple[Tensor, Tensor]:
+    """Inverses (xx, xy, yy) [M, 3] of M Mᵀ + 0.3 1 for M [M, 2, 3] [pixels], and its diagonals [M, 2].
+
+    The determinant is |m₁ × m₂|² + 0.3 (|m₁|² + |m₂|²) + 0.3², in which nothing cancels: long and thin spots stay
+    positive definite in float32. Lengths are divided by the longer row, so that no square overflows.
+    """
+    length = half_axes.detach().square().sum(2).amax(1).clamp(min=BLUR).sqrt()
+    first, second = (half_axes / length[:, None, None]).unbind(1)
+    blur = BLUR / length.square()
+    xx, yy, xy = first.square().sum(1) + blur, second.square().sum(1) + blur, (first * second).sum(1)
+    determinant = torch.linalg.cross(first, second).square().sum(1) + blur * (xx + yy - blur)
+    conic = torch.stack([yy, -xy, xx], 1) / (determinant * length.square())[:, None]
+    return conic, torch.stack([xx, yy], 1) * length.square()[:, None]
+
+
 def project(gaussians: Gaussians, camera: Camera) -> Spots:
     """Gaussians in front of the camera as spots: Σ₂ = J W Σ Wᵀ Jᵀ + 0.3 1 with the Jacobian J of the projection.
 
@@ -72,11 +87,9 @@ def project(gaussians: Gaussians, camera: Camera) -> Spots:
     zero = torch.zeros_like(z)
     rows = (torch.stack([1 / z, zero, -u / z], 1), torch.stack([zero, 1 / z, -v / z], 1))
     half_axes = view.focal * torch.stack(rows, 1) @ (view.rotation @ gaussians.axes[order])  # [M, 2, 3]
-    xx, yy = (half_axes.square().sum(2) + BLUR).unbind(1)
-    xy = (half_axes[:, 0] * half_axes[:, 1]).sum(1)
-    conic = torch.stack([yy, -xy, xx], 1) / (xx * yy - xy * xy)[:, None]
+    conic, variances = _inverse(half_axes)
     opacity = gaussians.opacity[order]
     towards = torch.nn.functional.normalize(gaussians.x[order] - view.position, dim=1)
     deviations = (2 * (opacity.detach() / FAINTEST).log().clamp(min=0)).sqrt()
-    reach = deviations[:, None] * torch.stack([xx, yy], 1).detach().sqrt()
+    reach = deviations[:, None] * variances.detach().sqrt()
     return Spots(center, conic, opacity, colors(gaussians.harmonics[order], towards), reach)
