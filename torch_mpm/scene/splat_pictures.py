@@ -28,7 +28,7 @@ from .scene import Scene
 from .splat_bodies import up_axis
 from .splat_frames import Progress, SplatFrames
 
-PIXELS, SAMPLES = 6, (2000, 60_000)
+PIXELS, SAMPLES = 3, (2000, 60_000)
 """Pixels of a picture for each Gaussian on the surface of an obstacle, and the range of the number of these."""
 WIDTH, THINNESS = 0.6, 0.06
 """Deviations of such a Gaussian along and across the surface, relative to the distance of its neighbours."""
