@@ -11,11 +11,12 @@ DOCS = Path(__file__).parent.parent / "docs"
 
 
 @pytest.mark.filterwarnings("ignore:Anomaly Detection")
-@pytest.mark.parametrize("name", ["training.md", "recipes.md"])
-def test_programs_of_a_document(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("name", ["training.md", "recipes.md", "splats.md"])
+def test_programs_of_a_document(name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     text = (DOCS / name).read_text()
     module = types.ModuleType("document")  # which compilers look for
     monkeypatch.setitem(sys.modules, "document", module)
+    monkeypatch.chdir(tmp_path)  # for the files that they write
     programs = list(re.finditer(r"```python\n(.*?)```", text, re.DOTALL))
     assert programs
     for found in programs:

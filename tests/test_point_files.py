@@ -283,3 +283,36 @@ def test_ply_that_is_refused(form, tmp_path):
             point_files.read(path)
     with pytest.raises(ValueError, match="cannot be read"):
         point_files.read(ply(path, form, cut=60))
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_other_properties_are_fields_of_the_points(form, tmp_path):
+    """In their order, so that they are those of the particles with these ids."""
+    points = seed.file(ply(tmp_path / "scan.ply", form))
+    assert points.fields.keys() == {"red", "intensity"}
+    assert points.fields["red"].dtype == torch.int64 and points.fields["red"].tolist() == [1, 200, 255]
+    assert points.fields["intensity"].is_floating_point() and points.fields["intensity"].tolist() == [0.5, 0.25, 4.0]
+    assert seed.box((0, 0), (1, 1), 0.5).fields == {}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"vertex 3": "vertex -3"}, "the number of its vertices must be a whole number, got '-3'"),
+        ({"vertex 3": "vertex 3e0"}, "the number of its vertices must be a whole number, got '3e0'"),
+        ({"uchar red": "uchar x"}, "its vertices have the property x twice"),
+        ({" 200 ": " 256 "}, "its property red has a number that is no uint8"),
+        ({" 200 ": " 20.5 "}, "its property red has a number that is no uint8"),
+        ({" 200 ": " nan "}, "its property red has a number that is no uint8"),
+        ({"uchar red": "list uchar uchar red"}, "its header has an unknown line: 'property list uchar uchar red'"),
+    ],
+)
+def test_headers_and_numbers_of_a_ply_that_are_refused(changes, message, tmp_path):
+    path = ply(tmp_path / "scan.ply", "ascii")
+    text = path.read_text()
+    for old, new in changes.items():
+        assert old in text
+        text = text.replace(old, new, 1)
+    path.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        point_files.read(path)

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 from . import _interrupted_start as _interrupted_start  # First, as the imports below take a second or more.
 from . import _library as _library
-from . import _moved, laws, ops
+from . import _moved, laws, ops, splats
 from .boundaries import SDF, Box, Capsule, Obstacle, Plane, Revolved, Sphere, Walls, Waypoints
 from .data.trajectory import Trajectory
 from .errors import (
@@ -114,6 +114,7 @@ __all__ = [
     "scatter",
     "seed",
     "shapes",
+    "splats",
     "stable_dt",
     "substeps_arguments",
     "svd3",

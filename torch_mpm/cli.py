@@ -1,4 +1,4 @@
-"""The command line: ``torch-mpm run SCENE -o DIR``, check, info, schema, render, export, and those of data sets."""
+"""The command line: ``torch-mpm run SCENE -o DIR``, check, info, schema, render, export, splats, and for data sets."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from .data import host_memory
 from .data import reading_commands as reading
 from .data.commands import path_argument, set_argument
 from .interrupts import alarm
+from .splats.picture import BACKENDS
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -146,9 +147,7 @@ def _parser() -> argparse.ArgumentParser:
 
     run = commands.add_parser("run", help="simulate a scene file")
     _scene_arguments(run)
-    run.add_argument("-o", "--out", required=True, type=path_argument, help="folder for the results")
-    run.add_argument("--resume", action="store_true", help="continue an unfinished run")
-    run.add_argument("--quiet", action="store_true", help="no progress bar")
+    _run_arguments(run)
     run.set_defaults(command=_run)
 
     check = commands.add_parser("check", help="check a scene file without simulating it")
@@ -175,9 +174,30 @@ def _parser() -> argparse.ArgumentParser:
     reading.add_export_options(export)
     export.set_defaults(command=_export)
 
+    splats = commands.add_parser(
+        "splats", help="simulate an object of Gaussian splats; write its splats and pictures of each frame"
+    )
+    splats.add_argument("file", type=path_argument, help="object (.ply of 3-D Gaussian splatting)")
+    splats.add_argument(
+        "--scene", type=path_argument,
+        help='scene file (TOML) with a body of shape = "splats", whose file is replaced; by default jelly on the floor',
+    )  # fmt: skip
+    set_argument(splats, "body[0].up=-y")
+    splats.add_argument(
+        "--backend", choices=BACKENDS, default="auto", help="renderer of the pictures; default: %(default)s"
+    )
+    _run_arguments(splats)
+    splats.set_defaults(command=_splats)
+
     reading.add(commands)
     data_sets.add(commands)
     return parser
+
+
+def _run_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("-o", "--out", required=True, type=path_argument, help="folder for the results")
+    parser.add_argument("--resume", action="store_true", help="continue an unfinished run")
+    parser.add_argument("--quiet", action="store_true", help="no progress bar")
 
 
 def _scene_arguments(parser: argparse.ArgumentParser, optional: bool = False) -> None:
@@ -188,19 +208,37 @@ def _scene_arguments(parser: argparse.ArgumentParser, optional: bool = False) ->
 # ---- commands
 
 
+Outputs = list[tuple[str, Callable[[], dict[str, Path]]]]
+"""Outputs beside a trajectory: names, and functions that write them and return their paths."""
+
+
 def _run(options: argparse.Namespace) -> None:
     from .scene import Scene
+
+    scene = Scene.load(options.scene, options.overrides)
+    _require_outputs(scene)
+    _simulate(scene, options, options.scene.read_text(encoding="utf-8"), _outputs(scene, options))
+
+
+def _splats(options: argparse.Namespace) -> None:
+    from .scene.splat_scene import require_renderer, splat_scene
+
+    scene, source = splat_scene(options.file, options.scene, options.overrides)
+    require_renderer(options.backend)
+    _require_outputs(scene.model_copy(update={"render": None}))
+    _simulate(scene, options, source, _splat_outputs(scene, options))
+
+
+def _simulate(scene: Any, options: argparse.Namespace, source: str, outputs: Outputs) -> None:
+    """Simulate a scene with the text ``source``, and write the outputs that the folder lacks."""
     from .scene.diagnose import SceneFailure
     from .scene.folder import finished
     from .scene.run import Interrupted, run
 
     begin = time.perf_counter()
-    scene = Scene.load(options.scene, options.overrides)
-    _require_outputs(scene)
     complete = options.resume and finished(options.out, scene.fingerprint()) is not None
     bar = None if options.quiet else _Bar()
     notice = None if bar is None else bar.notice
-    source = options.scene.read_text(encoding="utf-8")
     try:
         summary = run(scene, options.out, resume=options.resume, source=source, progress=bar, notice=notice)
     except (SceneFailure, Interrupted):
@@ -211,7 +249,7 @@ def _run(options: argparse.Namespace) -> None:
         bar.close()
     seconds = summary.setdefault("seconds", {})
     files = {"trajectory": options.out / "trajectory.h5"}
-    missing = [(n, make) for n, make in _outputs(scene, options) if n not in seconds or not _is_there(n, options.out)]
+    missing = [(n, make) for n, make in outputs if n not in seconds or not _is_there(n, options.out)]
     if complete and not missing:
         print(f"{options.out} holds the complete run of this scene")
         return
@@ -242,11 +280,11 @@ def _require_outputs(scene: Any) -> None:
         meshio_module()
 
 
-def _outputs(scene: Any, options: argparse.Namespace) -> list[tuple[str, Callable[[], dict[str, Path]]]]:
-    """Outputs of the scene beside its trajectory: names, and functions that write them and return their paths."""
+def _outputs(scene: Any, options: argparse.Namespace) -> Outputs:
+    """Outputs of the scene."""
     from .data import export
 
-    outputs: list[tuple[str, Callable[[], dict[str, Path]]]] = []
+    outputs: Outputs = []
     if scene.render is not None:
         outputs.append(("pictures", lambda: _draw(options.out, scene, options.quiet)))
     if scene.output.vtk:
@@ -256,29 +294,49 @@ def _outputs(scene: Any, options: argparse.Namespace) -> list[tuple[str, Callabl
     return outputs
 
 
+def _splat_outputs(scene: Any, options: argparse.Namespace) -> Outputs:
+    """Splats and pictures of a scene with an object of splats."""
+    from .scene.splat_frames import write_frames
+    from .scene.splat_pictures import draw_frames
+
+    def write() -> dict[str, Path]:
+        with _progress("splats", scene, options.quiet) as progress:
+            return {"splats": write_frames(options.out, scene, progress)[0].parent}
+
+    def draw() -> dict[str, Path]:
+        with _progress("pictures", scene, options.quiet) as progress:
+            return _pictures(draw_frames(options.out, scene, options.backend, scene.torch_device(), progress))
+
+    return [("splats", write), ("pictures", draw)]
+
+
 def _is_there(name: str, out: Path) -> bool:
     """Whether the files of an output exist."""
-    return (out / {"pictures": "frames", "VTK": "vtk/run.pvd", "PLY": "ply"}[name]).exists()
+    return (out / {"pictures": "frames", "VTK": "vtk/run.pvd", "PLY": "ply", "splats": "splats"}[name]).exists()
 
 
 def _draw(folder: Path, scene: Any, quiet: bool) -> dict[str, Path]:
     """Draw a run; returns the paths of its pictures and its video."""
     from .scene.pictures import draw
 
-    made = draw(folder, scene) if quiet else _draw_with_a_bar(folder, scene)
+    with _progress("pictures", scene, quiet) as progress:
+        return _pictures(draw(folder, scene, progress))
+
+
+def _pictures(made: Sequence[Path]) -> dict[str, Path]:
+    """Folder of pictures, and the video, if there is one."""
     video = {"video": made[-1]} if made[-1].suffix == ".mp4" else {}
     return {"pictures": made[0].parent, **video}
 
 
-def _draw_with_a_bar(folder: Path, scene: Any) -> list[Path]:
-    from .scene.pictures import draw
-
-    with _tqdm()(desc="pictures", unit="frame", total=scene.frames + 1) as bar:
-
-        def progress(k: int, frames: int) -> None:
-            bar.update(k + 1 - bar.n)
-
-        return draw(folder, scene, progress)
+@contextlib.contextmanager
+def _progress(name: str, scene: Any, quiet: bool) -> Iterator[Callable[[int, int], None] | None]:
+    """Progress bar of an output: a function of a frame and their number; None where it is quiet."""
+    if quiet:
+        yield None
+        return
+    with _tqdm()(desc=name, unit="frame", total=scene.frames + 1) as bar:
+        yield lambda k, frames: bar.update(k + 1 - bar.n)
 
 
 def _check(options: argparse.Namespace) -> None:

@@ -33,6 +33,7 @@ BOX = {"shape": "box", "lower": (0.1, 0.1), "upper": (0.3, 0.3), "material": "je
         ({"grid__dxx": 1}, "grid.dxx: unknown key; did you mean 'dx'?"),
         ({"material__jelly__desnity": 1}, "material.jelly.desnity: unknown key; did you mean 'density'?"),
         ({"body__0__shape": "spere"}, "body[0].shape: takes one of 'box', 'sphere', 'cylinder', 'capsule', 'mesh', 'points', "
+         "'splats', "
          "got 'spere'; did you mean 'sphere'?"),
         ({"body": [{"radius": 1}]}, "body[0].shape: missing; takes one of 'box'"),
         ({"material__jelly__law": "neo_hooke"}, "material.jelly.law: takes one of 'neo_hookean', 'weakly_compressible', 'quartic_sand', 'cam_clay',"),

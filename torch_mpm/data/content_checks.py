@@ -51,8 +51,9 @@ def value_problems(words: Words, particles: bool, obstacles: bool) -> Iterator[s
                 )
     yield from _vector_problems(words)
     for k, item in enumerate(words.get("body", [])):
-        if particles and "points" in _values(item, "shape"):
-            yield f"body[{k}].shape: points have a number of their own; remove dataset.particles or the body"
+        for kind in ("points", "splats") if particles else ():
+            if kind in _values(item, "shape"):
+                yield f"body[{k}].shape: {kind} have a number of their own; remove dataset.particles or the body"
     for k, item in enumerate(words.get("obstacle", [])):
         if obstacles and (any(v != 0 for v in _values(item, "start")) or _values(item, "end")):
             yield (

@@ -37,7 +37,7 @@ Array = npt.NDArray[Any]
 FORMAT = 2
 COMPLETE = "trajectory.h5"
 PARTIAL = "trajectory.partial.h5"
-STATICS = ("mass", "volume", "material", "scene")
+STATICS = ("mass", "volume", "material", "scene", "gaussian")
 COUNTERS = ("frames_written", "checksum")
 
 UNITS = {
@@ -45,6 +45,7 @@ UNITS = {
     **dict.fromkeys(MEASURES, "Pa"),
     "liquid": "1", "heat": "J", "mass": "kg", "volume": "m^3",
     "material": "index into attribute names", "scene": "index into attribute names",
+    "gaussian": "number of the Gaussian; -1 inside an object, -2 elsewhere",
     "time": "s", "particles": "1", "substeps": "1", "kinetic_energy": "J", "elastic_energy": "J",
     "potential_energy": "J", "momentum": "kg m/s", "cfl": "1", "frames_written": "1",
     "checksum": "CRC-32",

@@ -9,6 +9,7 @@ import itertools
 import math
 import re
 import zipfile
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import IO, Any, NamedTuple
@@ -279,15 +280,33 @@ def _read_ply(path: Path, dim: int | None) -> PointFile:
             values = np.loadtxt(itertools.islice(lines, count), ndmin=2, comments=None)
             if values.shape[1] != len(names):
                 raise ValueError(f"its rows have {values.shape[1]} numbers, not {len(names)} as its header says")
-            fields = {name: values[:, k] for k, name in enumerate(names)}
+            fields = {name: _declared(name, values[:, k], dtype[name]) for k, name in enumerate(names)}
         else:
             rows = np.frombuffer(handle.read(count * dtype.itemsize), dtype, count)
             fields = {name: rows[name].astype(rows[name].dtype.newbyteorder("=")) for name in names}
     if len(fields["x"]) != count:
         raise ValueError(f"it has {len(fields['x'])} of its {count} vertices")
-    x = np.stack([fields.pop(axis).astype(np.float64) for axis in "xyz"], 1)
+    with np.errstate(invalid="ignore"):  # For NaN of all kinds.
+        x = np.stack([fields.pop(axis).astype(np.float64) for axis in "xyz"], 1)
     volume = fields.pop("volume", None)
     return PointFile(x, None if volume is None else volume.astype(np.float64), fields)
+
+
+def _count(text: str) -> int:
+    """Number of vertices of a header."""
+    if not (text.isascii() and text.isdigit()):
+        raise ValueError(f"the number of its vertices must be a whole number, got {text!r:.100}")
+    return int(text)
+
+
+def _declared(name: str, values: Array, dtype: np.dtype[Any]) -> Array:
+    """Numbers of an ASCII file in the type of their property, if it is an integer; others stay in float64."""
+    if dtype.kind == "f":
+        return values
+    ends = np.iinfo(dtype)
+    if not ((values >= ends.min) & (values <= ends.max) & (values == np.floor(values))).all():
+        raise ValueError(f"its property {name} has a number that is no {dtype.name}")
+    return values.astype(dtype)
 
 
 def _ply_header(handle: IO[bytes]) -> tuple[str, int, list[str], np.dtype[Any]]:
@@ -303,7 +322,7 @@ def _ply_header(handle: IO[bytes]) -> tuple[str, int, list[str], np.dtype[Any]]:
                 elements += 1
                 if elements == 1 and name != "vertex":
                     raise ValueError(f"its first element must be vertex, got {name}")
-                count = int(number) if elements == 1 else count
+                count = _count(number) if elements == 1 else count
             case ["property", kind, name] if kind in PLY_TYPES:
                 properties += [(name, order + PLY_TYPES[kind])] if elements == 1 else []
             case ["property", "list", _, _, _] if elements > 1:
@@ -313,6 +332,8 @@ def _ply_header(handle: IO[bytes]) -> tuple[str, int, list[str], np.dtype[Any]]:
             case _:
                 raise ValueError(f"its header has an unknown line: {' '.join(words)!r}")
     names = [name for name, _ in properties]
+    if twice := [name for name, uses in Counter(names).items() if uses > 1]:
+        raise ValueError(f"its vertices have the property {twice[0]} twice")
     if not order:
         raise ValueError("its header has no line with the format, such as 'format ascii 1.0'")
     if not {"x", "y", "z"} <= set(names):

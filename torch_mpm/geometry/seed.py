@@ -17,11 +17,12 @@ import functools
 import itertools
 import math
 import numbers
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -29,6 +30,7 @@ from ..data import host_memory
 from ..errors import check_count, check_device, check_dtype, check_number, check_vector, default_dtype, shape_of
 from . import point_files, shapes
 from .shapes import Shape
+from .surface_mesh import Array
 
 Vector = Sequence[float] | Tensor
 Progress = Callable[[int, int], None] | None
@@ -62,13 +64,17 @@ CHUNK = 2**18
 class Points:
     """Positions ``x`` [P, D] [m], rest volumes ``volume`` [P] [m^3] ([m^2] in 2-D), ``scene`` int32 [P] or None.
 
-    ``exact`` are x and volume in float64 where `x` and `volume` are roundings of these, otherwise None.
+    ``exact`` are x and volume in float64 where `x` and `volume` are roundings of these, otherwise None. ``fields`` are
+    other numbers of the points [P] by name, such as the colours of a .ply file. A `State` has no such fields: its
+    particles have the ids 0, 1, ... in the order of the points, so that ``fields["red"][state.ids]`` are theirs in any
+    order.
     """
 
     x: Tensor
     volume: Tensor
     scene: Tensor | None = None
     exact: tuple[Tensor, Tensor] | None = None
+    fields: Mapping[str, Tensor] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return self.x.shape[0]
@@ -416,7 +422,9 @@ def file(
 ) -> Points:
     """Points from a file: .npy, .npz, .csv, .tsv, .txt or .ply.
 
-    `torch_mpm.point_files.read` describes the formats, and returns other properties of a .ply too, such as colours.
+    `torch_mpm.geometry.point_files.read` describes the formats. Other properties of a .ply, such as colours and those
+    of Gaussian splats, are in ``fields`` of the result: floating-point numbers in the type of the file, others as
+    int64.
 
     ``volume`` is the total volume [m^3], shared evenly; needed where the file has no volumes. ``dim`` is the number of
     coordinates, by default those in the file. ``origin``, ``dtype`` and ``device`` as in :func:`fill`.
@@ -442,4 +450,10 @@ def file(
         raise ValueError(f"volumes in {path} must be positive with shape [{len(x)}], got {list(volumes.shape)}")
     if not bool(torch.isfinite(x).all() and torch.isfinite(volumes).all()):
         raise ValueError(f"points in {path} must be finite")
-    return _points(x, volumes, origin, dtype, device)
+    points = _points(x, volumes, origin, dtype, device)
+    return replace(points, fields={name: _field(values).to(points.x.device) for name, values in read.fields.items()})
+
+
+def _field(values: Array) -> Tensor:
+    """Property of a file as a tensor."""
+    return torch.from_numpy(values if values.dtype.kind == "f" else values.astype(np.int64))

@@ -18,6 +18,13 @@ from .shapes import Array, Samples, Shape, surface_samples
 AMBIENT, DIFFUSE = 0.36, 0.85
 
 
+def lit(color: Array, normals: Array, camera: Camera) -> Array:
+    """Colours [N, 3], or one [3], on a surface with unit normals [N, 3] under the lights of a camera."""
+    lights = zip(light_directions(camera), LIGHTS, strict=True)
+    strength = AMBIENT + sum(DIFFUSE * power * np.maximum(normals @ towards, 0) for towards, power in lights)
+    return np.asarray(color * np.asarray(strength)[:, None])
+
+
 def _screened(samples: Samples, opacity: float) -> Samples:
     """Stipple that covers a share `opacity` of the samples."""
     kept = np.arange(len(samples.points)) * 0.618034 % 1 < opacity
@@ -33,14 +40,8 @@ class SoftwareScene:
     def draw(self, x: Array, rgb: Array, radius: float, style: str, obstacles: Sequence[Shape]) -> Array:
         """The picture, uint8 [H, W, 3], of finite positions x [P, 3] m with colours uint8 [P, 3]."""
         samples = [_screened(surface_samples(o, count=40_000), o.opacity) for o in obstacles]
-        if self.ground is None:
-            image = np.empty((*self.camera.resolution[::-1], 3), dtype=np.uint8)
-            image[:] = (BACKGROUND * 255).round()
-        else:
-            spread = [np.full(len(x), radius), *(np.full(len(s.points), s.radius) for s in samples)]
-            texture = self.ground.texture(np.concatenate([x, *(s.points for s in samples)]), np.concatenate(spread))
-            image = self._ground_pixels(texture)
-        image = self._outline(image)
+        spread = [np.full(len(x), radius), *(np.full(len(s.points), s.radius) for s in samples)]
+        image = self.backdrop(np.concatenate([x, *(s.points for s in samples)]), np.concatenate(spread))
         seen = visible(x, 2 * radius) if len(x) else np.zeros(0, dtype=bool)
         tint = [np.tile(np.array(o.color) * 255, (len(s.points), 1)) for o, s in zip(obstacles, samples, strict=True)]
         # Samples of a surface are flat discs with its normal, a little larger than their share so that they overlap.
@@ -51,6 +52,17 @@ class SoftwareScene:
         normals = np.concatenate([np.zeros((int(seen.sum()), 3)), *(s.normals for s in samples)])
         self._splat(image, points, radii, np.concatenate([rgb[seen], *tint]), normals)
         return image
+
+    def backdrop(self, points: Array, radii: Array) -> Array:
+        """The ground with the shadows of spheres at points [N, 3] with radii [N] [m], and the outline of the bounds,
+        uint8 [H, W, 3].
+        """
+        if self.ground is None:
+            image = np.empty((*self.camera.resolution[::-1], 3), dtype=np.uint8)
+            image[:] = (BACKGROUND * 255).round()
+        else:
+            image = self._ground_pixels(self.ground.texture(points, radii))
+        return self._outline(image)
 
     def close(self) -> None:
         """Nothing to release."""
@@ -85,11 +97,7 @@ class SoftwareScene:
         round_normal = u[:, None] * camera.right - v[:, None] * camera.up - bulge[:, None] * camera.forward
         normal = np.where(flat[owner][:, None], normals[owner], round_normal)
         normal = np.where((normal @ camera.forward > 0)[:, None], -normal, normal)
-        strength = AMBIENT + sum(
-            DIFFUSE * power * np.maximum(normal @ towards, 0)
-            for towards, power in zip(light_directions(camera), LIGHTS, strict=True)
-        )
-        image.reshape(-1, 3)[pixel] = (rgb[owner] * strength[:, None]).clip(0, 255).astype(np.uint8)
+        image.reshape(-1, 3)[pixel] = lit(rgb[owner], normal, camera).clip(0, 255).astype(np.uint8)
 
     def _ground_pixels(self, texture: Array) -> Array:
         """Intersection of each pixel's ray with the ground, and the texture there; elsewhere the background."""

@@ -20,7 +20,7 @@ from ..laws.sand import QuarticSand
 from ..laws.thermal import LIQUID
 from ..state.state import State
 from ..step.step import Step
-from . import check, heat, schema
+from . import check, heat, schema, splat_bodies
 from .explain import SceneError
 from .obstacles import obstacles
 from .places import obstacle, region
@@ -68,6 +68,8 @@ class Built:
     scenes: list[str]
     projected: Tensor | None = None
     """Particles of each scene that were moved out of obstacles, int64 [B]; None unless the scene wants that."""
+    gaussian: Tensor | None = None
+    """Numbers of the Gaussians of the initial particles, int32 [P], see `splat_bodies.numbers`; None without any."""
 
     def emissions(self) -> list[tuple[float, int]]:
         """(time, nozzle) of every layer, in the order of appearance."""
@@ -79,7 +81,7 @@ class Built:
         return len(self.state) + sum(len(n.layer) * len(n.times) for n in self.nozzles)
 
     def statics(self) -> dict[str, Tensor]:
-        """Mass, volume, material and scene of all particles, including those not yet emitted, by id."""
+        """Mass, volume, material, scene and Gaussian of all particles, including those not yet emitted, by id."""
         layers = [(self.nozzles[k].layer, self.nozzles[k].material) for _, k in self.emissions()]
         states = [self.state, *(layer for layer, _ in layers)]
         material = [self.material, *(torch.full((len(s),), m, dtype=torch.int32, device="cpu") for s, m in layers)]
@@ -90,6 +92,9 @@ class Built:
         }
         if len(self.scenes) > 1:
             values["scene"] = torch.cat([s.scene for s in states if s.scene is not None])
+        if self.gaussian is not None:
+            emitted = torch.full((self.particles - len(self.state),), splat_bodies.NONE, dtype=torch.int32)
+            values["gaussian"] = torch.cat([self.gaussian, emitted])
         return {name: value.cpu() for name, value in values.items()}
 
 
@@ -163,7 +168,9 @@ def build(scene: Any, device: torch.device) -> Built:
         state, moved = step.project(state)
     _check_fields(scene, state)
     nozzles = [Nozzle(step.prepare(n.layer), n.material, n.times) for n in nozzles]
-    return Built(grid, step, state, torch.cat(material), mixture.materials, nozzles, [e.name for e in entries], moved)
+    gaussian = splat_bodies.numbers([points for bodies in placed for _, _, points, _ in bodies])
+    names = [entry.name for entry in entries]
+    return Built(grid, step, state, torch.cat(material), mixture.materials, nozzles, names, moved, gaussian)
 
 
 def _named(key: str, make: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
@@ -325,7 +332,7 @@ def _placed(scene: Any, origin: Sequence[float] | None, entry: Any, problems: li
         if not _is_good(key, problems):
             continue
         try:
-            points, shape = _seeded(scene, origin, body, (scene.seed if entry.seed is None else entry.seed) + k)
+            points, shape = _seeded(scene, origin, entry, body, (scene.seed if entry.seed is None else entry.seed) + k)
         except (ValueError, OSError) as error:
             problems.append(f"{key}{check.called(body)}: {error}")
             continue
@@ -346,11 +353,13 @@ def _is_good(key: str, problems: list[str]) -> bool:
 
 
 def _seeded(
-    scene: Any, origin: Sequence[float] | None, body: Any, number: int
+    scene: Any, origin: Sequence[float] | None, entry: Any, body: Any, number: int
 ) -> tuple[seed.Points, seed.Region | None]:
     if isinstance(body, schema.PointsBody):
         options = {"dim": scene.dim, "origin": origin, "dtype": torch.float64}
         return seed.file(scene.folder / body.file, body.volume, **options), None
+    if isinstance(body, schema.SplatsBody):
+        return splat_bodies.seeded(scene, origin, entry, body, number), None
     shape = region(body, scene.folder)
     assert shape is not None
     options = {"method": body.seeding, "seed": number, "count": body.particles, "dtype": torch.float64}

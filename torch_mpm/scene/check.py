@@ -58,7 +58,7 @@ def problems(scene: Any, entries: Sequence[Any]) -> list[str]:
 def file_problems(entry: Any, folder: Path) -> Iterator[str]:
     """Unreadable files of bodies."""
     for key, body in entry.keyed("body"):
-        if isinstance(body, (schema.MeshBody, schema.PointsBody)):
+        if isinstance(body, schema.FileBody):
             try:
                 check_file(folder / body.file, body.shape)
             except OSError as error:
@@ -191,7 +191,7 @@ def _item_problems(key: str, item: Any, scene: Any) -> list[str]:
     try:
         if isinstance(item, schema.Emitter):
             return [*_nozzle_problems(key, item, scene)]
-        if isinstance(item, schema.PointsBody) and item.particles is not None:
+        if isinstance(item, (schema.PointsBody, schema.SplatsBody)) and item.particles is not None:
             return [f"{key}.particles: the particles of {item.file} are those of the file; remove the key"]
         shape = region(item, None)
         return [] if shape is None else list(bounds_problems(key, item, shape, scene.grid))
@@ -211,8 +211,9 @@ def obstacle_problems(key: str, item: schema.Obstacle, dim: int) -> list[str]:
 
 
 def _dimension_problems(key: str, item: Any, dim: int) -> Iterator[str]:
-    if dim == 2 and getattr(item, "shape", "") in ("mesh", "cylinder"):
-        yield f"{key}.shape: a {item.shape} needs three dimensions; this scene has two"
+    if dim == 2 and getattr(item, "shape", "") in ("mesh", "cylinder", "splats"):
+        what = "splats need" if item.shape == "splats" else f"a {item.shape} needs"
+        yield f"{key}.shape: {what} three dimensions; this scene has two"
         return
     values = vars(item)
     for name in ("lower", "upper", *schema.VECTOR_KEYS, "velocity", "offset"):
@@ -249,12 +250,17 @@ def inside(grid: schema.Grid, x: Tensor) -> bool:
 
 
 def outside(path: str, lower: Tensor, upper: Tensor, grid: schema.Grid, origin: Sequence[float] | None = None) -> str:
+    return f"{path}: {reach(lower, upper, grid, origin)}"
+
+
+def reach(lower: Tensor, upper: Tensor, grid: schema.Grid, origin: Sequence[float] | None = None) -> str:
+    """Problem of a body with corners outside the domain, in the coordinates of the file."""
     ends = [
         _numbers([float(a) + b for a, b in zip(corner, origin or (0.0,) * len(grid.lower), strict=True)])
         for corner in (lower, upper, grid.lower, grid.upper)
     ]
     return (
-        f"{path}: reaches from {ends[0]} to {ends[1]}, outside the domain {ends[2]} to {ends[3]}; "
+        f"reaches from {ends[0]} to {ends[1]}, outside the domain {ends[2]} to {ends[3]}; "
         "move the body or enlarge grid.lower, grid.upper"
     )
 

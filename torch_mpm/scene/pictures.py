@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -37,6 +37,31 @@ def draw(folder: str | Path, scene: Scene, progress: Any = None) -> list[Path]:
         SceneError: when `scene.render` does not fit the trajectory.
         ImportError: when a package of the extra ``render`` is missing.
     """
+
+    def artist(trajectory: Trajectory) -> _Artist:
+        words = scene.render or schema.Render()
+        if problems := list(_problems(scene, words, trajectory)):
+            raise SceneError(problems, scene.source)
+        return _Artist(scene, words, trajectory)
+
+    return draw_by(artist, folder, scene, progress)
+
+
+class Artist(Protocol):
+    """Pictures of the frames of a run."""
+
+    way: str
+    """Hash of everything that affects the picture of a frame."""
+
+    def picture(self, frame: dict[str, Array]) -> Array:
+        """Picture of a frame, uint8 [H, W, 3]."""
+
+    def close(self) -> None:
+        """Release resources."""
+
+
+def draw_by(make: Callable[[Trajectory], Artist], folder: str | Path, scene: Scene, progress: Any = None) -> list[Path]:
+    """Draw the trajectory in ``folder`` by the artist that ``make`` returns for it; the rest as `draw`."""
     from ..render import assemble_video, write_png
     from ..render.images import note_of
 
@@ -46,12 +71,9 @@ def draw(folder: str | Path, scene: Scene, progress: Any = None) -> list[Path]:
     with Trajectory(folder) as trajectory, output_folder(target):
         if not len(trajectory):
             raise FileNotFoundError(f"{trajectory.path} has no frames yet")
-        problems = list(_problems(scene, words, trajectory))
-        if problems:
-            raise SceneError(problems, scene.source)
+        artist = make(trajectory)
         numbers = range(0, len(trajectory), words.every)
         paths = [target / f"{k:05d}.png" for k in numbers]
-        artist = _Artist(scene, words, trajectory)
         for k, path in zip(numbers, paths, strict=True):
             if note_of(path) != artist.way:
                 write_png(path, artist.picture(trajectory.frame(k)), note=artist.way)

@@ -127,12 +127,18 @@ class Scene(schema.SceneData):
         """
         drawn = self.render.color_by if self.render else ""
         needed = {"stress": "von_mises_stress"}.get(drawn, drawn)
-        names = {*self.output.fields, *([needed] if needed in RANKS else [])}
+        names = {*self.output.fields, *([needed] if needed in RANKS else []), *self._deformations()}
         if self.output.vtk and "cauchy_stress" not in names:
             names.add("stress")
         if self.output.vtk and self.dim == 2:
             names.add("out_of_plane_stress")
         return [name for name in get_args(schema.StoredField) if name in names]
+
+    def _deformations(self) -> set[str]:
+        """Fields with the deformation of Gaussians."""
+        bodies = [(entry, body) for entry in self.entries() for body in entry.body if body.shape == "splats"]
+        materials = [entry.material.get(body.material) for entry, body in bodies]
+        return {"J" if isinstance(words, schema.WeaklyCompressible) else "F" for words in materials}
 
     def torch_device(self) -> torch.device:
         """Raises SceneError for a device that does not exist."""
@@ -180,7 +186,7 @@ class Scene(schema.SceneData):
             raise SceneError(problems, self.source)
         for entry in entries:
             for body in entry.body:
-                if isinstance(body, (schema.MeshBody, schema.PointsBody)):
+                if isinstance(body, schema.FileBody):
                     digest.update((self.folder / body.file).read_bytes())
         return digest.hexdigest()[:16]
 

@@ -352,9 +352,29 @@ class PointsBody(Body):
     """total volume [m^3], needed if the file has no volumes"""
 
 
-AnyBody = Annotated[
-    BoxBody | SphereBody | CylinderBody | CapsuleBody | MeshBody | PointsBody, Field(discriminator="shape")
-]
+class SplatsBody(Body):
+    """Object of 3-D Gaussian splats (3-D): a particle for each Gaussian, and others that fill its inside."""
+
+    shape: Literal["splats"] = "splats"
+    """kind of shape"""
+    file: str
+    """.ply file of Gaussian splats, relative to the scene file"""
+    up: Literal["+x", "-x", "+y", "-y", "+z", "-z"] = "+y"
+    """axis of the file that points up: against gravity, or +y without gravity"""
+    extent: Positive | None = None
+    """longest edge of the box around the object [m]; by default as in the file"""
+    center: Vector | None = None
+    """middle of this box [m]; by default as in the file"""
+    fill: bool = True
+    """fill the inside with per_cell particles per grid cell that carry no Gaussian; false for thin shells"""
+    min_opacity: Annotated[float, Field(ge=0, le=1)] = 0.02
+    """opacity below which Gaussians are left out"""
+
+
+FileBody = MeshBody | PointsBody | SplatsBody
+"""Bodies from a file."""
+
+AnyBody = Annotated[BoxBody | SphereBody | CylinderBody | CapsuleBody | FileBody, Field(discriminator="shape")]
 
 
 class Emitter(Seeding):
