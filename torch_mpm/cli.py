@@ -1,4 +1,6 @@
-"""The command line: ``torch-mpm run SCENE -o DIR``, check, info, schema, render, export, and those of data sets."""
+"""The command line: ``torch-mpm run SCENE -o DIR``, check, info, schema, render, export, surface, and those of data
+sets.
+"""
 
 from __future__ import annotations
 
@@ -15,12 +17,12 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from . import optional
 from .data import commands as data_sets
-from .data import host_memory
+from .data import host_memory, progress
 from .data import reading_commands as reading
 from .data.commands import path_argument, set_argument
 from .interrupts import alarm
+from .surfaces import commands as surfaces
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -111,7 +113,7 @@ def warnings_in_lines() -> Iterator[None]:
 
 REPORTED = (
     "SceneError", "OutputError", "DamagedFileError", "SimulationError", "Interrupted", "RenderError", "WorkerError",
-    "IncompleteError", "VerifyError", "DatasetError", "MissingError", "FailedScenesError",
+    "IncompleteError", "VerifyError", "DatasetError", "MissingError", "FailedScenesError", "SurfaceError",
 )  # fmt: skip
 """Errors reported by their message alone; others by their traceback."""
 
@@ -175,6 +177,7 @@ def _parser() -> argparse.ArgumentParser:
     reading.add_export_options(export)
     export.set_defaults(command=_export)
 
+    surfaces.add(commands)
     reading.add(commands)
     data_sets.add(commands)
     return parser
@@ -236,6 +239,10 @@ def _require_outputs(scene: Any) -> None:
         assert render
         for module in ("matplotlib", "PIL", "imageio_ffmpeg", *(["vtk"] if scene.dim == 3 else [])):
             require(module)
+        if scene.render.surface:
+            from .surfaces.reconstruction import require_packages
+
+            require_packages()
     if scene.output.vtk or scene.output.ply:
         from .data.export import meshio_module
 
@@ -265,20 +272,10 @@ def _draw(folder: Path, scene: Any, quiet: bool) -> dict[str, Path]:
     """Draw a run; returns the paths of its pictures and its video."""
     from .scene.pictures import draw
 
-    made = draw(folder, scene) if quiet else _draw_with_a_bar(folder, scene)
+    with progress.frame_bar("pictures", quiet) as shown:
+        made = draw(folder, scene, shown)
     video = {"video": made[-1]} if made[-1].suffix == ".mp4" else {}
     return {"pictures": made[0].parent, **video}
-
-
-def _draw_with_a_bar(folder: Path, scene: Any) -> list[Path]:
-    from .scene.pictures import draw
-
-    with _tqdm()(desc="pictures", unit="frame", total=scene.frames + 1) as bar:
-
-        def progress(k: int, frames: int) -> None:
-            bar.update(k + 1 - bar.n)
-
-        return draw(folder, scene, progress)
 
 
 def _check(options: argparse.Namespace) -> None:
@@ -347,15 +344,11 @@ def _export(options: argparse.Namespace) -> None:
 # ---- messages
 
 
-def _tqdm() -> Any:
-    return optional.load("tqdm", "the progress bar, which --quiet disables", "scene").tqdm
-
-
 class _Bar:
     """Progress bar of a run; the first report gives the number of frames."""
 
     def __init__(self) -> None:
-        self._make = _tqdm()
+        self._make = progress.tqdm()
         self._bar: Any = None
 
     def __call__(self, figures: dict[str, Any]) -> None:

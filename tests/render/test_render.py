@@ -235,7 +235,7 @@ def test_surface_is_closed_and_at_the_particles():
     ball = lattice((-1, -1, -1), (1, 1, 1), s)
     ball = ball[np.linalg.norm(ball, axis=1) < 0.8]
     x = np.concatenate([ball, [[1.5, 0, 0]]])
-    skin = cloud.surface(x, np.full((len(x), 3), 90, np.uint8), s)
+    skin, loose = cloud.surface(x, np.full((len(x), 3), 90, np.uint8), s)
     radius = np.linalg.norm(skin.vertices, axis=1)
     assert np.abs(radius - 0.8).max() < s
     assert np.all(np.sum(skin.normals * skin.vertices, axis=1) > 0)
@@ -243,7 +243,7 @@ def test_surface_is_closed_and_at_the_particles():
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert 0.5 * np.linalg.norm(normal, axis=1).sum() == pytest.approx(4 * np.pi * 0.8**2, rel=0.05)
     assert np.sum(normal * corners[:, 0]) / 6 == pytest.approx(4 / 3 * np.pi * 0.8**3, rel=0.05)  # divergence theorem
-    assert skin.loose[-1] and skin.loose[:-1].mean() < 0.01
+    assert loose[-1] and loose[:-1].mean() < 0.01
 
 
 def test_surface_style_draws(backend):

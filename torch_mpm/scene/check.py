@@ -174,6 +174,10 @@ def render_problems(scene: Any) -> Iterator[str]:
             yield f"render.view: takes a lower and an upper corner of {dim} numbers each, got {words.view}"
     if dim == 2 and words.style == "surface":
         yield "render.style: a surface needs three dimensions; this scene has two"
+    if dim == 2 and words.surface:
+        yield "render.surface: a surface needs three dimensions; this scene has two"
+    if words.surface and words.style == "surface":
+        yield "render.surface: takes style = 'particles', that of sand, got 'surface'"
     if dim == 3 and words.exaggeration != 1:
         yield f"render.exaggeration: is for 2-D scenes, got {words.exaggeration}"
     if words.ritter is not None and (dim == 3 or not any(scene.gravity or ())):
