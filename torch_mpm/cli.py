@@ -1,5 +1,5 @@
-"""The command line: ``torch-mpm run SCENE -o DIR``, check, info, schema, render, export, surface, and those of data
-sets.
+"""The command line: ``torch-mpm run SCENE -o DIR``, check, info, schema, render, export, surface, usd, and those of
+data sets.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from .data import reading_commands as reading
 from .data.commands import path_argument, set_argument
 from .interrupts import alarm
 from .surfaces import commands as surfaces
+from .usd import commands as usd
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -113,7 +114,7 @@ def warnings_in_lines() -> Iterator[None]:
 
 REPORTED = (
     "SceneError", "OutputError", "DamagedFileError", "SimulationError", "Interrupted", "RenderError", "WorkerError",
-    "IncompleteError", "VerifyError", "DatasetError", "MissingError", "FailedScenesError", "SurfaceError",
+    "IncompleteError", "VerifyError", "DatasetError", "MissingError", "FailedScenesError", "SurfaceError", "UsdError",
 )  # fmt: skip
 """Errors reported by their message alone; others by their traceback."""
 
@@ -178,6 +179,7 @@ def _parser() -> argparse.ArgumentParser:
     export.set_defaults(command=_export)
 
     surfaces.add(commands)
+    usd.add(commands)
     reading.add(commands)
     data_sets.add(commands)
     return parser

@@ -22,6 +22,16 @@ from torch_mpm.scene import surfaces as run_surfaces  # noqa: E402
 from torch_mpm.scene.folder import load_run  # noqa: E402
 from torch_mpm.surfaces import files  # noqa: E402
 
+SAND = """
+duration = 0.01
+fps = 100
+device = "cpu"
+grid = { lower = [0.0, 0.0, 0.0], upper = [1.0, 1.0, 1.0], dx = 0.1 }
+material.sand = { law = "quartic_sand", E = 1e5 }
+body = [{ shape = "box", lower = [0.1, 0.1, 0.1], upper = [0.3, 0.3, 0.3], material = "sand" }]
+render = { surface = true, resolution = [64, 48], video = false }
+"""
+
 SPACING, RADIUS = 0.02, 0.3
 CENTRE = np.array([0.4, -0.2, 0.7])
 
@@ -120,6 +130,9 @@ def test_surface_far_from_zero():
 def test_no_particles_have_an_empty_surface():
     surface = surfaces.reconstruct(np.zeros((0, 3), np.float32), SPACING, 2 * SPACING)
     assert [a.shape for a in surface] == [(0, 3)] * 3
+    found = surfaces.Interpolation(ball(), surface.vertices, 3 * SPACING)
+    assert found.mean(np.zeros((len(ball()), 2, 2))).shape == (0, 2, 2)
+    assert found.linear(np.zeros((len(ball()), 3))).shape == (0, 3)
 
 
 @pytest.mark.parametrize(
@@ -143,7 +156,7 @@ def test_particles_without_a_surface(x, options, message):
     [
         ({"smoothing_length": 0.0}, "smoothing_length must be positive and finite, got 0.0"),
         ({"cube_size": np.inf}, "cube_size must be positive and finite, got inf"),
-        ({"iso_threshold": 1.0}, "iso_threshold must be between 0 and 1, got 1.0"),
+        ({"iso_threshold": 1.0}, "iso_threshold must be within 0.05 and 0.95, got 1.0"),
         ({"smoothing": -1}, "smoothing must not be negative, got -1"),
         ({"smoothing": 101}, "smoothing must be at most 100, got 101"),
     ],
@@ -248,8 +261,8 @@ def test_surfaces_of_a_batch_have_the_names_of_their_scenes(tmp_path):
     text = '[[scene]]\nname = "one/a"\n[[scene]]\nname = "two"\n[[scene]]\nname = "one a"\n'
     run = small_run(tmp_path, "[0.0, -9.8, 0.0]", text)
     with Trajectory(run) as trajectory:
-        bodies = run_surfaces.RunSurfaces(load_run(run), trajectory).bodies
-        assert [(b.name, b.scene) for b in bodies] == [("one_a_rubber_0", 0), ("two_rubber", 1), ("one_a_rubber_2", 2)]
+        groups = run_surfaces.RunSurfaces(load_run(run), trajectory).groups
+        assert [(g.name, g.scene) for g in groups] == [("one_a_rubber_0", 0), ("two_rubber", 1), ("one_a_rubber_4", 2)]
 
 
 def test_pictures_of_surfaces(run, tmp_path, monkeypatch):
@@ -279,7 +292,7 @@ def test_pictures_of_surfaces(run, tmp_path, monkeypatch):
     ("words", "message"),
     [
         ("--cube-size nan", "--cube-size must be positive and finite, got nan"),
-        ("--iso-threshold 2", "--iso-threshold must be between 0 and 1, got 2.0"),
+        ("--iso-threshold 2", "--iso-threshold must be within 0.05 and 0.95, got 2.0"),
         ("--smoothing -1", "--smoothing must not be negative, got -1"),
         ("--smoothing-length 9", "smoothing_length must be within"),
         ("--material snow", "materials are rubber, sand, got 'snow'"),
@@ -305,6 +318,17 @@ def test_a_run_in_two_dimensions_is_refused(tmp_path, capsys):
 def test_two_styles_of_surfaces_are_refused(run, capsys):
     assert main(["render", str(run), "--set", "render.surface=true", "--set", "render.style=surface"]) == 1
     assert "render.surface: takes style = 'particles'" in capsys.readouterr().err
+
+
+def test_surfaces_of_sand_alone_are_refused(tmp_path, capsys):
+    path = tmp_path / "scene.toml"
+    path.write_text(SAND)
+    assert main(["check", str(path)]) == 1
+    assert "render.surface: all materials are sand, which is drawn as particles" in capsys.readouterr().err
+    words = ["--set", "render.surface=false", "--set", "render.every=9", "--quiet"]
+    assert main(["run", str(path), "-o", str(tmp_path / "out"), *words]) == 0
+    assert main(["surface", str(tmp_path / "out")]) == 1
+    assert "all materials are sand (sand)" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("package", "words"), [("pysplashsurf", ""), ("meshio", ""), ("vtkmodules", "--format vtp")])

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from ..surfaces.reconstruction import Surface
 from .annotate import blend, scale_overlay, scale_width, write_text
-from .camera import framing, light_directions
+from .camera import framing, light_directions, up_axis
 from .cloud import Skin, rest_spacing
 from .colors import PALETTES, PLAIN, QUANTITIES, Quantity, map_colors, numpy_of, palette_colors, scalar_of, value_range
 from .ground import Ground
@@ -102,7 +102,7 @@ class Renderer:
         else:
             self.backend = _choose(backend)
             fill = (1 - 1.7 * scale_width(self.resolution) if color_by else 0.92, 0.86)
-            up = _up(gravity)
+            up = up_axis(gravity)
             camera = framing(*frame, up, self.resolution, azimuth, elevation, fill=fill)
             plate = Ground(*self.bounds, up, -light_directions(camera)[0]) if ground else None
             draws = Scene3D if self.backend == "vtk" else SoftwareScene
@@ -214,12 +214,6 @@ def _box(name: str, box: tuple[npt.ArrayLike, npt.ArrayLike], dim: int | None) -
     if not np.all(lower < upper):
         raise ValueError(f"{name} must be (lower, upper) with lower < upper, got {lower.tolist()}, {upper.tolist()}")
     return lower, upper
-
-
-def _up(gravity: npt.ArrayLike | None) -> Array:
-    down = np.array([0.0, -1.0, 0.0]) if gravity is None else vector("gravity", gravity, 3)
-    length = float(np.linalg.norm(down))
-    return np.array([0.0, 1.0, 0.0]) if length == 0 else -down / length
 
 
 def _choose(backend: str) -> str:

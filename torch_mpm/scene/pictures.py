@@ -19,7 +19,7 @@ from .explain import SceneError
 from .fields import RANKS
 from .places import obstacle
 from .scene import Scene
-from .surfaces import BodySurface, RunSurfaces
+from .surfaces import GroupSurface, RunSurfaces
 
 FOLDER, VIDEO = "frames", "video.mp4"
 SAMPLES = 8
@@ -145,12 +145,12 @@ class _Artist:
         time = float(frame["time"])
         surfaces = [] if self.surfaces is None else self.surfaces.of_frame(frame)
         pictures = [
-            self._one(k, frame, time, [found for found in surfaces if found.body.scene == k])
+            self._one(k, frame, time, [found for found in surfaces if found.group.scene == k])
             for k in range(len(self.entries))
         ]
         return pictures[0] if len(pictures) == 1 else contact_sheet(pictures, self.columns, self.words.resolution[0])
 
-    def _one(self, k: int, frame: dict[str, Array], time: float, surfaces: Sequence[BodySurface]) -> Array:
+    def _one(self, k: int, frame: dict[str, Array], time: float, surfaces: Sequence[GroupSurface]) -> Array:
         from ..render import obstacle_shapes
 
         entry = self.entries[k]
@@ -174,7 +174,7 @@ class _Artist:
             surfaces=[(found.surface, self._at_vertices(found, values)) for found in surfaces],
         )
 
-    def _at_vertices(self, found: BodySurface, values: Array) -> Array:
+    def _at_vertices(self, found: GroupSurface, values: Array) -> Array:
         """Values of particles at the vertices of a surface; categories are not interpolated."""
         from ..render.colors import PALETTES
 

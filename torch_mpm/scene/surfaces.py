@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,8 +12,7 @@ import numpy as np
 
 from ..data.export import CollectedFile, write_collection
 from ..data.trajectory import Array, Trajectory
-from ..data.whole_files import file_name, output_folder, output_path
-from ..errors import DamagedFileError
+from ..data.whole_files import output_folder, output_path
 from ..surfaces.files import require_writer, write_surface
 from ..surfaces.interpolation import Interpolation
 from ..surfaces.reconstruction import (
@@ -23,10 +22,9 @@ from ..surfaces.reconstruction import (
     SurfaceOptions,
     reconstruct,
     require_packages,
-    spacing_of,
 )
-from . import schema
-from .folder import REMEDY, load_run
+from .folder import load_run
+from .groups import Group, groups_of
 from .scene import Scene
 
 log = logging.getLogger(__name__)
@@ -36,25 +34,12 @@ COLLECTION = "run.pvd"
 
 
 @dataclass(frozen=True)
-class SurfaceBody:
-    """Particles with a common surface: those of one material in one scene of the batch.
-
-    ``name`` is a part of file names; ``scene`` and ``material`` are indices of the trajectory.
-    """
-
-    name: str
-    scene: int
-    material: int
-    lengths: Lengths
-
-
-@dataclass(frozen=True)
-class BodySurface:
-    """Surface of a body in a frame: ``rows`` bool [P] of its particles, and the interpolation to its vertices, None
+class GroupSurface:
+    """Surface of a group in a frame: ``rows`` bool [P] of its particles, and the interpolation to its vertices, None
     without particles.
     """
 
-    body: SurfaceBody
+    group: Group
     surface: Surface
     rows: Array
     interpolation: Interpolation | None
@@ -115,43 +100,17 @@ class RunSurfaces:
         names = trajectory.names("material")
         if unknown := [name for name in materials if name not in names]:
             raise SurfaceError(f"{trajectory.path}: materials are {', '.join(names)}, got {unknown[0]!r}")
-        statics = trajectory.statics
-        chosen = list(self._chosen(scene, trajectory, statics, materials))
-        if not chosen:
+        groups = groups_of(scene, trajectory)
+        self.groups = [g for g in groups if (g.material in materials if materials else not g.grains)]
+        if not self.groups:
             raise SurfaceError(
                 f"{trajectory.path}: all materials are sand ({', '.join(names)}), which has a surface only where its "
                 "material is named"
             )
-        parts = _names([label for _, _, label in chosen])
-        spacings = [spacing_of(statics["volume"][self._rows(statics, k, m)]) for k, m, _ in chosen]
-        self.bodies = [
-            SurfaceBody(name, k, m, self.options.lengths(spacing, self.dx))
-            for (k, m, _), name, spacing in zip(chosen, parts, spacings, strict=True)
-        ]
+        self.lengths = [self.options.lengths(group.spacing, self.dx) for group in self.groups]
 
-    @staticmethod
-    def _chosen(
-        scene: Scene, trajectory: Trajectory, statics: dict[str, Array], materials: Sequence[str]
-    ) -> Iterator[tuple[int, int, str]]:
-        """Scene, material and label of each body."""
-        entries = scene.entries()
-        names = trajectory.names("material")
-        of_scene = statics.get("scene", np.zeros_like(statics["material"]))
-        for k, m in sorted(set(zip(of_scene.tolist(), statics["material"].tolist(), strict=True))):
-            name = names[m]
-            if k >= len(entries) or name not in entries[k].material:
-                raise DamagedFileError(trajectory.path, f"has material {name!r} in scene {k}, which has none", REMEDY)
-            grains = isinstance(entries[k].material[name], schema.QuarticSand)
-            if name in materials if materials else not grains:
-                yield k, m, f"{entries[k].name}_{name}" if len(entries) > 1 else name
-
-    @staticmethod
-    def _rows(arrays: dict[str, Array], scene: int, material: int) -> Array:
-        rows: Array = arrays["material"] == material
-        return rows & (arrays["scene"] == scene) if "scene" in arrays else rows
-
-    def of_frame(self, frame: dict[str, Array]) -> list[BodySurface]:
-        """Surfaces of the bodies in a frame of the trajectory, in the order of ``bodies``.
+    def of_frame(self, frame: dict[str, Array]) -> list[GroupSurface]:
+        """Surfaces of the groups in a frame of the trajectory, in the order of ``groups``.
 
         Particles that are not finite or outside of the domain are skipped and logged.
         """
@@ -159,20 +118,14 @@ class RunSurfaces:
         inside = ((x >= self.lower - self.dx) & (x <= self.upper + self.dx)).all(1)
         if not inside.all():
             log.warning("%d of %d particles are outside of the domain and have no surface", (~inside).sum(), len(x))
-        return [self._of_body(body, x, inside & self._rows(frame, body.scene, body.material)) for body in self.bodies]
+        pairs = zip(self.groups, self.lengths, strict=True)
+        return [self._of_group(group, lengths, x, inside & group.rows(frame)) for group, lengths in pairs]
 
-    def _of_body(self, body: SurfaceBody, x: Array, rows: Array) -> BodySurface:
+    def _of_group(self, group: Group, lengths: Lengths, x: Array, rows: Array) -> GroupSurface:
         own = x[rows]
-        surface = reconstruct(own, body.lengths.spacing, self.dx, self.options)
-        if not len(own):
-            return BodySurface(body, surface, rows, None)
-        return BodySurface(body, surface, rows, Interpolation(own, surface.vertices, 2 * body.lengths.smoothing))
-
-
-def _names(labels: Sequence[str]) -> list[str]:
-    """Different names for files."""
-    names = [file_name(label) or "material" for label in labels]
-    return [f"{name}_{k}" if names.count(name) > 1 else name for k, name in enumerate(names)]
+        surface = reconstruct(own, group.spacing, self.dx, self.options)
+        interpolation = Interpolation(own, surface.vertices, 2 * lengths.smoothing) if len(own) else None
+        return GroupSurface(group, surface, rows, interpolation)
 
 
 def export_surfaces(
@@ -225,8 +178,8 @@ def _write_frames(
         for part, found in enumerate(surfaces.of_frame(frame)):
             velocity = found.velocity(frame)
             for name in formats:
-                write_surface(folder / f"{found.body.name}_{k:05d}.{name}", found.surface, velocity)
-            collected.append(CollectedFile(float(frame["time"]), f"{found.body.name}_{k:05d}.vtp", part))
+                write_surface(folder / f"{found.group.name}_{k:05d}.{name}", found.surface, velocity)
+            collected.append(CollectedFile(float(frame["time"]), f"{found.group.name}_{k:05d}.vtp", part))
         if progress is not None:
             progress(k, len(trajectory))
     if "vtp" in formats:

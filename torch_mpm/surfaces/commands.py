@@ -10,6 +10,7 @@ from ..data.commands import folder_argument, path_argument
 from ..data.progress import frame_bar
 
 FORMATS = ("ply", "obj", "vtp")
+PARAMETERS = ("smoothing_length", "cube_size", "iso_threshold", "smoothing")
 
 
 def add(commands: Any) -> None:
@@ -41,7 +42,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(f"--{name}", type=float, metavar="M", help=f"{text} [m]")
     parser.add_argument(
         "--iso-threshold", type=float, default=0.6, metavar="X",
-        help="value on the surface, 0 to 1, smaller for larger bodies; default: %(default)s",
+        help="value on the surface, 0.05 to 0.95, smaller for larger bodies; default: %(default)s",
     )  # fmt: skip
     parser.add_argument(
         "--smoothing", type=int, default=3, metavar="N", help="smoothing steps of the mesh; default: %(default)s"
@@ -64,6 +65,16 @@ def require_a_run(folder: Path, command: str) -> None:
         raise SurfaceError(f"{folder}: {command} is for runs, and this is a data set")
 
 
+def require_surface(options: argparse.Namespace) -> None:
+    """Refuse parameters of a reconstruction without ``--surface``."""
+    from .reconstruction import SurfaceError, SurfaceOptions
+
+    given = [name for name in PARAMETERS if getattr(options, name) != getattr(SurfaceOptions(), name)]
+    given += ["material"] if options.materials else []
+    if given and not options.surface:
+        raise SurfaceError(f"--{given[0].replace('_', '-')} is for --surface")
+
+
 def surface_options(options: argparse.Namespace) -> Any:
     """The parameters of a reconstruction.
 
@@ -72,9 +83,8 @@ def surface_options(options: argparse.Namespace) -> Any:
     """
     from .reconstruction import SurfaceError, SurfaceOptions
 
-    names = ("smoothing_length", "cube_size", "iso_threshold", "smoothing")
     try:
-        return SurfaceOptions(**{name: getattr(options, name) for name in names})
+        return SurfaceOptions(**{name: getattr(options, name) for name in PARAMETERS})
     except ValueError as error:
         name, _, rest = str(error).partition(" ")
         raise SurfaceError(f"--{name.replace('_', '-')} {rest}") from None

@@ -27,8 +27,9 @@ class Interpolation:
 
     def __init__(self, x: Array, points: Array, reach: float) -> None:
         tree = optional.load("scipy.spatial", "surfaces", "surface").cKDTree(x)
-        distance, index = tree.query(points, k=min(NEIGHBOURS, len(x)), workers=-1)
-        self.index = index.reshape(len(points), -1)
+        count = min(NEIGHBOURS, len(x))
+        distance, index = tree.query(points, k=count, workers=-1)
+        self.index = index.reshape(len(points), count)
         distance = distance.reshape(self.index.shape)
         limit = np.maximum(reach, 1.01 * distance[:, :1] + 1e-300)
         weight = np.square(np.clip(1 - np.square(distance / limit), 0, None))
@@ -42,7 +43,7 @@ class Interpolation:
 
     def mean(self, values: Array) -> Array:
         """Weighted mean of values [P, ...], [V, ...]: in the range of the neighbours, of first order in the spacing."""
-        near = values[self.index].reshape(*self.index.shape, -1)
+        near = values.reshape(len(values), -1)[self.index]
         out: Array = (self.weight[:, None] @ near).reshape(len(near), *values.shape[1:])
         return out
 

@@ -2,7 +2,7 @@
 
 The surface is the level set of the smoothed indicator function of the particles, sum_p V_p W(x - x_p), with the volume
 V_p of a particle from its SPH density and the cubic spline W. Marching cubes extract it, and weighted Laplacian
-smoothing (Loeschner et al. 2023) removes the bumps of single particles.
+smoothing (Loeschner et al. 2023), which keeps drops, removes the bumps of single particles.
 """
 
 from __future__ import annotations
@@ -26,6 +26,8 @@ DEFAULT_SMOOTHING, LEAST_SMOOTHING, MOST_SMOOTHING = 0.75, 1.5, 3.0
 """Default of the smoothing length [node distances], and its least and most [particle spacings]."""
 DEFAULT_CUBE = 0.5
 """Default of the cube size [smoothing lengths]."""
+ISO_THRESHOLDS = (0.05, 0.95)
+"""Range of the threshold: beyond it the surface is that of the kernels, or of rounding errors."""
 MOST_STEPS = 100
 """Maximum number of steps of the smoothing of a mesh."""
 
@@ -52,8 +54,8 @@ class SurfaceOptions:
         smoothing_length: of the SPH kernel [m], half its radius; by default 0.75 node distances, and at least 1.5 and
             at most 3 particle spacings.
         cube_size: edge of the cubes of marching cubes [m]; half of the smoothing length by default.
-        iso_threshold: value of the indicator function on the surface, between 0 and 1; smaller values give larger
-            bodies. With the defaults a ball of 10 particle spacings has its volume to 2%.
+        iso_threshold: value of the indicator function on the surface, within 0.05 and 0.95; smaller values give
+            larger bodies. With the defaults a ball of 10 particle spacings has its volume to 2%.
         smoothing: number of steps of the smoothing of the mesh, which shrinks drops; the normals are smoothed as often.
 
     Raises:
@@ -69,7 +71,8 @@ class SurfaceOptions:
         for name in ("smoothing_length", "cube_size"):
             if (value := getattr(self, name)) is not None:
                 check_number(name, value, "positive and finite", lambda number: 0 < number < np.inf)
-        check_number("iso_threshold", self.iso_threshold, "between 0 and 1", lambda number: 0 < number < 1)
+        low, high = ISO_THRESHOLDS
+        check_number("iso_threshold", self.iso_threshold, f"within {low} and {high}", lambda n: low <= n <= high)
         if check_count("smoothing", self.smoothing) > MOST_STEPS:
             raise ValueError(f"smoothing must be at most {MOST_STEPS}, got {self.smoothing}")
 
