@@ -257,6 +257,34 @@ def test_surfaces_of_a_run(run, tmp_path, capsys):
     assert {p.name for p in (tmp_path / "sand").iterdir()} == {f"sand_{k:05d}.ply" for k in range(3)}
 
 
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ({"formats": ["stl"]}, "the format must be one of ply, obj, vtp, got 'stl'"),
+        ({"every": 0}, "every must be at least 1, got 0"),
+    ],
+)
+def test_wrong_arguments_of_an_export(run, tmp_path, words, message):
+    with pytest.raises(ValueError, match=message):
+        surfaces.export_surfaces(run, tmp_path / "out", **words)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("frame", [0, 1])
+def test_an_interrupted_export_leaves_whole_files(run, tmp_path, monkeypatch, frame):
+    write = run_surfaces.write_surface
+
+    def interrupted(path, *rest):
+        if f"{frame:05d}" in path.name:
+            raise KeyboardInterrupt
+        write(path, *rest)
+
+    monkeypatch.setattr(run_surfaces, "write_surface", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        surfaces.export_surfaces(run, tmp_path / "out")
+    assert [p.name for p in tmp_path.rglob("*")] == (["out", "rubber_00000.ply"] if frame else [])
+
+
 def test_surfaces_of_a_batch_have_the_names_of_their_scenes(tmp_path):
     text = '[[scene]]\nname = "one/a"\n[[scene]]\nname = "two"\n[[scene]]\nname = "one a"\n'
     run = small_run(tmp_path, "[0.0, -9.8, 0.0]", text)

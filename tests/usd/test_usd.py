@@ -257,7 +257,7 @@ def test_a_file_is_as_large_as_its_numbers(run, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("suffix", [".usdc", ".usda", ".usd"])
 def test_formats(run, tmp_path, capsys, suffix):
-    path = tmp_path / "new" / f"a{suffix}"
+    path = tmp_path / "new" / f"a [1]@{suffix}"
     assert main(["usd", str(run), "-o", str(path), "--every", "2"]) == 0
     assert capsys.readouterr().out.strip() == str(path)
     assert path.read_bytes().startswith(b"#usda" if suffix == ".usda" else b"PXR-USDC")

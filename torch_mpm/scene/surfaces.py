@@ -13,6 +13,7 @@ import numpy as np
 from ..data.export import CollectedFile, write_collection
 from ..data.trajectory import Array, Trajectory
 from ..data.whole_files import output_folder, output_path
+from ..errors import check_count
 from ..surfaces.files import require_writer, write_surface
 from ..surfaces.interpolation import Interpolation
 from ..surfaces.reconstruction import (
@@ -154,8 +155,10 @@ def export_surfaces(
     Raises:
         FileNotFoundError: when the folder has no run, or no frame yet.
         DamagedFileError: for a run that is damaged, or a link out of its folder in place of the output.
-        SurfaceError, ImportError: as `RunSurfaces`; ImportError also for a missing package of a format.
+        SurfaceError, ImportError: as `RunSurfaces`; also for an unknown format, and a missing package of a format.
+        ValueError, TypeError: for ``every``.
     """
+    check_count("every", every, 1)
     for name in formats:
         require_writer(name)
     scene = load_run(run)

@@ -11,6 +11,7 @@ import numpy as np
 
 from ..data.trajectory import Array, Trajectory
 from ..data.whole_files import output_path, remove_leftovers
+from ..errors import check_count
 from ..geometry.surface_mesh import frame_of
 from ..render.boundaries import obstacle_shapes
 from ..render.camera import framing, up_axis
@@ -67,7 +68,9 @@ def export_usd(
         SurfaceError: as `RunSurfaces`.
         ImportError: when usd-core is missing (extra ``usd``), or with ``surface`` a package of its extra.
         OSError: when the file cannot be written; nothing remains of it.
+        ValueError, TypeError: for ``every``.
     """
+    check_count("every", every, 1)
     pxr("Usd")
     scene = load_run(run)
     path = output_path(Path(run), FILE, out)

@@ -9,7 +9,7 @@ import numpy as np
 
 from .. import optional
 from ..data.whole_files import replacing
-from .reconstruction import Array, Surface
+from .reconstruction import Array, Surface, SurfaceError
 
 PACKAGES = {"ply": ("meshio", "surface"), "obj": ("trimesh", "surface"), "vtp": ("vtkmodules", "render")}
 """Package that writes a format, and its extra."""
@@ -32,7 +32,9 @@ def write_surface(path: Path, surface: Surface, velocity: Array) -> None:
 
 
 def require_writer(name: str) -> None:
-    """Raise ImportError for a missing package of a format."""
+    """Raise ImportError for a missing package of a format, and SurfaceError for an unknown format."""
+    if name not in PACKAGES:
+        raise SurfaceError(f"the format must be one of {', '.join(PACKAGES)}, got {name!r}")
     package, extra = PACKAGES[name]
     optional.load(package, f"{name.upper()} files", extra)
 
