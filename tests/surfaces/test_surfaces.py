@@ -82,21 +82,22 @@ def test_normals_point_outward():
     assert (mesh_of(surface).vertex_normals * surface.normals).sum(1).min() > 0.9  # the winding of the triangles
 
 
-def test_velocity_of_a_rigid_rotation():
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_velocity_of_a_rigid_rotation(dtype):
     """The linear interpolation is exact for it, although all particles are on one side of the surface."""
-    x = ball(np.float64)
+    x = ball(dtype)
     surface = surfaces.reconstruct(x, SPACING, 2 * SPACING)
     omega, shift = np.array([1.0, -2.0, 3.0]), np.array([5.0, 0.0, -1.0])
     expected = np.cross(omega, surface.vertices - CENTRE) + shift
     found = surfaces.Interpolation(x, surface.vertices, 3 * SPACING)
     speed = RADIUS * np.linalg.norm(omega)
-    velocity = np.cross(omega, x - CENTRE) + shift
+    velocity = (np.cross(omega, x - CENTRE) + shift).astype(dtype)
     assert np.abs(found.linear(velocity) - expected).max() < 1e-3 * speed
     assert np.abs(found.mean(velocity) - expected).max() > 0.02 * speed  # which the mean is not
 
 
 def test_interpolation_keeps_constants_and_the_range():
-    x = ball()
+    x = ball(np.float64)
     points = surfaces.reconstruct(x, SPACING, 2 * SPACING).vertices
     found = surfaces.Interpolation(x, points, 3 * SPACING)
     values = np.random.default_rng(1).random((len(x), 2, 2))

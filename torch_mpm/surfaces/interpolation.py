@@ -17,7 +17,7 @@ class Interpolation:
     """Weights of the nearest particles at some points.
 
     Args:
-        x: positions of particles [P, 3] [m], P > 0.
+        x: positions of particles [P, 3] [m], P > 0, in float32 or float64, which is the dtype of the weights.
         points: [V, 3] [m].
         reach: distance at which the weight of a particle vanishes [m]; farther particles count where none is nearer.
 
@@ -33,9 +33,9 @@ class Interpolation:
         distance = distance.reshape(self.index.shape)
         limit = np.maximum(reach, 1.01 * distance[:, :1] + 1e-300)
         weight = np.square(np.clip(1 - np.square(distance / limit), 0, None))
-        self.weight = weight / weight.sum(1, keepdims=True)
+        self.weight = (weight / weight.sum(1, keepdims=True)).astype(x.dtype)
         self._offset = x[self.index] - points[:, None]
-        self._floor = REGULAR * np.square(limit)
+        self._floor = (REGULAR * np.square(limit)).astype(x.dtype)
 
     def nearest(self, values: Array) -> Array:
         """Values [P, ...] of the nearest particle, [V, ...]."""
@@ -56,7 +56,7 @@ class Interpolation:
         mean, centre = weight @ near, weight @ self._offset
         spread = self._offset - centre
         weighted = (self.weight[..., None] * spread).swapaxes(1, 2)
-        moment = weighted @ spread + self._floor[..., None] * np.eye(3)
+        moment = weighted @ spread + self._floor[..., None] * np.eye(3, dtype=spread.dtype)
         gradient = np.linalg.solve(moment, weighted @ (near - mean))
         out: Array = (mean - centre @ gradient)[:, 0]
         return out.astype(values.dtype)
