@@ -1,4 +1,6 @@
-"""The command line: ``torch-mpm run SCENE -o DIR``, check, info, schema, render, export, splats, and for data sets."""
+"""The command line: ``torch-mpm run SCENE -o DIR``, check, info, schema, render, export, surface, usd, splats, and those
+of data sets.
+"""
 
 from __future__ import annotations
 
@@ -15,13 +17,14 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from . import optional
 from .data import commands as data_sets
-from .data import host_memory
+from .data import host_memory, progress
 from .data import reading_commands as reading
 from .data.commands import path_argument, set_argument
 from .interrupts import alarm
 from .splats.picture import BACKENDS
+from .surfaces import commands as surfaces
+from .usd import commands as usd
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -112,7 +115,7 @@ def warnings_in_lines() -> Iterator[None]:
 
 REPORTED = (
     "SceneError", "OutputError", "DamagedFileError", "SimulationError", "Interrupted", "RenderError", "WorkerError",
-    "IncompleteError", "VerifyError", "DatasetError", "MissingError", "FailedScenesError",
+    "IncompleteError", "VerifyError", "DatasetError", "MissingError", "FailedScenesError", "SurfaceError", "UsdError",
 )  # fmt: skip
 """Errors reported by their message alone; others by their traceback."""
 
@@ -189,6 +192,8 @@ def _parser() -> argparse.ArgumentParser:
     _run_arguments(splats)
     splats.set_defaults(command=_splats)
 
+    surfaces.add(commands)
+    usd.add(commands)
     reading.add(commands)
     data_sets.add(commands)
     return parser
@@ -274,6 +279,10 @@ def _require_outputs(scene: Any) -> None:
         assert render
         for module in ("matplotlib", "PIL", "imageio_ffmpeg", *(["vtk"] if scene.dim == 3 else [])):
             require(module)
+        if scene.render.surface:
+            from .surfaces.reconstruction import require_packages
+
+            require_packages()
     if scene.output.vtk or scene.output.ply:
         from .data.export import meshio_module
 
@@ -300,12 +309,12 @@ def _splat_outputs(scene: Any, options: argparse.Namespace) -> Outputs:
     from .scene.splat_pictures import draw_frames
 
     def write() -> dict[str, Path]:
-        with _progress("splats", scene, options.quiet) as progress:
-            return {"splats": write_frames(options.out, scene, progress)[0].parent}
+        with progress.frame_bar("splats", options.quiet) as shown:
+            return {"splats": write_frames(options.out, scene, shown)[0].parent}
 
     def draw() -> dict[str, Path]:
-        with _progress("pictures", scene, options.quiet) as progress:
-            return _pictures(draw_frames(options.out, scene, options.backend, scene.torch_device(), progress))
+        with progress.frame_bar("pictures", options.quiet) as shown:
+            return _pictures(draw_frames(options.out, scene, options.backend, scene.torch_device(), shown))
 
     return [("splats", write), ("pictures", draw)]
 
@@ -319,24 +328,14 @@ def _draw(folder: Path, scene: Any, quiet: bool) -> dict[str, Path]:
     """Draw a run; returns the paths of its pictures and its video."""
     from .scene.pictures import draw
 
-    with _progress("pictures", scene, quiet) as progress:
-        return _pictures(draw(folder, scene, progress))
+    with progress.frame_bar("pictures", quiet) as shown:
+        return _pictures(draw(folder, scene, shown))
 
 
 def _pictures(made: Sequence[Path]) -> dict[str, Path]:
     """Folder of pictures, and the video, if there is one."""
     video = {"video": made[-1]} if made[-1].suffix == ".mp4" else {}
     return {"pictures": made[0].parent, **video}
-
-
-@contextlib.contextmanager
-def _progress(name: str, scene: Any, quiet: bool) -> Iterator[Callable[[int, int], None] | None]:
-    """Progress bar of an output: a function of a frame and their number; None where it is quiet."""
-    if quiet:
-        yield None
-        return
-    with _tqdm()(desc=name, unit="frame", total=scene.frames + 1) as bar:
-        yield lambda k, frames: bar.update(k + 1 - bar.n)
 
 
 def _check(options: argparse.Namespace) -> None:
@@ -405,15 +404,11 @@ def _export(options: argparse.Namespace) -> None:
 # ---- messages
 
 
-def _tqdm() -> Any:
-    return optional.load("tqdm", "the progress bar, which --quiet disables", "scene").tqdm
-
-
 class _Bar:
     """Progress bar of a run; the first report gives the number of frames."""
 
     def __init__(self) -> None:
-        self._make = _tqdm()
+        self._make = progress.tqdm()
         self._bar: Any = None
 
     def __call__(self, figures: dict[str, Any]) -> None:

@@ -55,7 +55,7 @@ SET_KEYS = (
 FORMATS = ("gns", "well", "vtk", "ply", "tfrecord", "lagrangebench", "neuralmpm")
 COMMANDS = (
     *("run", "run", "check", "check", "info", "render", "export", "export", "generate", "generate", "verify", "stats"),
-    *("finalize", "view", "schema"),
+    *("finalize", "view", "schema", "surface", "usd"),
 )  # fmt: skip
 
 
@@ -80,6 +80,8 @@ def random_line(rng: random.Random, inputs: Path, out: Path) -> list[str]:
         "finalize": [_path(str(inputs / "set"), rng, inputs)],
         "view": [str(inputs / "nothing"), "--port", rng.choice(VALUES), "--host", rng.choice(VALUES)],
         "schema": [*_maybe("x", rng)],
+        "surface": [_path(folder, rng, inputs), "-o", str(out), *_surface(rng), *_maybe("--format", rng, VALUES)],
+        "usd": [_path(folder, rng, inputs), "-o", f"{out}.usdc", *_maybe("--grains", rng), *_surface(rng)],
     }  # fmt: skip
     return [command, *chosen[command]]
 
@@ -143,6 +145,17 @@ def _export(rng: random.Random) -> list[str]:
         *_maybe("--scenes", rng, ("0", "99", *VALUES)),
         *_maybe("--fields", rng, ("F", "stress", "velocity,velocity", "mass", *VALUES)),
         *_maybe("--context", rng),
+    ]
+
+
+def _surface(rng: random.Random) -> list[str]:
+    return [
+        *_maybe("--cube-size", rng, ("0.01", *VALUES)),
+        *_maybe("--smoothing-length", rng, ("0.02", *VALUES)),
+        *_maybe("--iso-threshold", rng, ("0.5", *VALUES)),
+        *_maybe("--smoothing", rng, ("1", *VALUES)),
+        *_maybe("--material", rng, ("jelly", *VALUES)),
+        *_maybe("--every", rng, ("2", *VALUES)),
     ]
 
 

@@ -20,6 +20,7 @@ iio = pytest.importorskip("imageio_ffmpeg")
 import torch_mpm as mpm  # noqa: E402
 from torch_mpm import render  # noqa: E402
 from torch_mpm.render import cloud, colors, requires, scene3d, shapes  # noqa: E402
+from torch_mpm.surfaces import Surface  # noqa: E402
 
 UNIT = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
 SMALL = (480, 270)
@@ -235,7 +236,7 @@ def test_surface_is_closed_and_at_the_particles():
     ball = lattice((-1, -1, -1), (1, 1, 1), s)
     ball = ball[np.linalg.norm(ball, axis=1) < 0.8]
     x = np.concatenate([ball, [[1.5, 0, 0]]])
-    skin = cloud.surface(x, np.full((len(x), 3), 90, np.uint8), s)
+    skin, loose = cloud.surface(x, np.full((len(x), 3), 90, np.uint8), s)
     radius = np.linalg.norm(skin.vertices, axis=1)
     assert np.abs(radius - 0.8).max() < s
     assert np.all(np.sum(skin.normals * skin.vertices, axis=1) > 0)
@@ -243,7 +244,7 @@ def test_surface_is_closed_and_at_the_particles():
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert 0.5 * np.linalg.norm(normal, axis=1).sum() == pytest.approx(4 * np.pi * 0.8**2, rel=0.05)
     assert np.sum(normal * corners[:, 0]) / 6 == pytest.approx(4 / 3 * np.pi * 0.8**3, rel=0.05)  # divergence theorem
-    assert skin.loose[-1] and skin.loose[:-1].mean() < 0.01
+    assert loose[-1] and loose[:-1].mean() < 0.01
 
 
 def test_surface_style_draws(backend):
@@ -251,6 +252,35 @@ def test_surface_style_draws(backend):
     with render.Renderer(UNIT, SMALL, color_by=None, ground=False, style="surface", backend=backend) as renderer:
         seen = centroid(renderer.frame(x), renderer.frame(np.zeros((0, 3))))
         assert np.abs(seen - renderer.project([x.mean(axis=0)])[0]).max() < 8
+
+
+def test_surfaces_are_drawn_beside_particles(backend):
+    """At their place, in the colour of their vertices, smooth, and in front of what they hide."""
+    ball = shapes.sphere((0, 0, 0), 0.15)
+    at = np.array([0.3, 0.5, 0.5])
+    mesh = Surface(ball.vertices + at, ball.faces, (ball.vertices / 0.15).astype(np.float32))
+    with render.Renderer(UNIT, SMALL, color_by="material", radius=0.05, ground=False, backend=backend) as renderer:
+        beside = np.array([[0.8, 0.5, 0.5]])
+        behind = at[None] + 0.4 * renderer.scene.camera.forward
+        values = np.ones(len(mesh.vertices))
+        empty = renderer.frame(np.zeros((0, 3)), np.zeros(0))
+        image = renderer.frame(np.zeros((0, 3)), np.zeros(0), surfaces=[(mesh, values)])
+        assert np.abs(centroid(image, empty) - renderer.project([at])[0]).max() < 3
+        column, row = renderer.project([at])[0].astype(int)
+        both = renderer.frame(np.concatenate([beside, behind]), np.zeros(2), surfaces=[(mesh, values)])
+        assert both[row, column, 0] > both[row, column, 2] + 60  # orange, material 1
+        column, row = renderer.project(beside)[0].astype(int)
+        assert both[row, column, 2] > both[row, column, 0] + 40  # blue, material 0
+        nothing = Surface(np.zeros((0, 3)), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
+        assert np.array_equal(renderer.frame(np.zeros((0, 3)), np.zeros(0), surfaces=[(nothing, np.zeros(0))]), empty)
+        with pytest.raises(ValueError, match=r"scalars must have shape \[P\]"):
+            renderer.frame(beside, np.zeros(1), surfaces=[(mesh, np.zeros(3))])
+
+
+def test_surfaces_in_two_dimensions_are_refused():
+    mesh = Surface(np.zeros((3, 3)), np.array([[0, 1, 2]], np.int32), np.zeros((3, 3), np.float32))
+    with pytest.raises(ValueError, match="surfaces need three dimensions, and the bounds have two"):
+        render.Renderer(((0, 0), (1, 1)), SMALL).frame(np.zeros((1, 2)), np.zeros(1), surfaces=[(mesh, np.zeros(3))])
 
 
 @pytest.mark.parametrize("dim", [2, 3])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
@@ -56,8 +56,7 @@ def write_vtk(frames: Iterable[dict[str, Array]], folder: Path, measures: Mappin
         folder: output folder.
         measures: measure of each stress, "Cauchy" or "Kirchhoff".
     """
-    collection = ElementTree.Element("VTKFile", type="Collection", version="0.1")
-    listing = ElementTree.SubElement(collection, "Collection")
+    files = []
     for k, frame in enumerate(frames):
         name = f"frame_{k:05d}.vtu"
         count = len(frame["position"])
@@ -68,11 +67,29 @@ def write_vtk(frames: Iterable[dict[str, Array]], folder: Path, measures: Mappin
             data["F"] = _three_dimensional(fields["F"], 1.0)
         cells = [("vertex", np.arange(count)[:, None])]
         _write(folder / name, _mesh(frame["position"], cells, {**data, "id": np.arange(count)}), {})
-        ElementTree.SubElement(listing, "DataSet", timestep=f"{float(frame['time']):.9g}", file=name)
+        files.append(CollectedFile(float(frame["time"]), name))
     index = folder / "run.pvd"
-    with replacing(index) as building:
-        ElementTree.ElementTree(collection).write(building, xml_declaration=True)
+    write_collection(index, files)
     return index
+
+
+class CollectedFile(NamedTuple):
+    """File of a collection: its time [s], its name, and its number among those of the same time."""
+
+    time: float
+    name: str
+    part: int = 0
+
+
+def write_collection(path: Path, files: Iterable[CollectedFile]) -> None:
+    """Write a .pvd file, the list of the VTK files of a run with their times, which ParaView opens."""
+    collection = ElementTree.Element("VTKFile", type="Collection", version="0.1")
+    listing = ElementTree.SubElement(collection, "Collection")
+    for file in files:
+        words = {"timestep": f"{file.time:.9g}", "file": file.name}
+        ElementTree.SubElement(listing, "DataSet", words | ({"part": str(file.part)} if file.part else {}))
+    with replacing(path) as building:
+        ElementTree.ElementTree(collection).write(building, xml_declaration=True)
 
 
 def write_ply(frames: Iterable[dict[str, Array]], folder: Path) -> Path:

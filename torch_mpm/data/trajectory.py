@@ -273,6 +273,11 @@ class Trajectory:
             self._check(name, k, row)
         return array
 
+    @property
+    def statics(self) -> dict[str, Array]:
+        """The quantities per particle [N]: mass, volume, material, and in a batch scene."""
+        return {name: self.file[name][:] for name in STATICS if name in self.file}
+
     def verify(self, frames: int) -> None:
         """Read the first frames and raise DamagedFileError for one that was changed."""
         for k in range(frames):

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
-from .shapes import Array
+from .shapes import Array, vector
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,13 @@ def framing(
         middle = 0.5 * (seen.min(axis=0) + seen.max(axis=0)) * distance
         center = center + middle[0] * right + middle[1] * top
     return Camera(center - distance * forward, right, top, forward, view_angle, resolution)
+
+
+def up_axis(gravity: npt.ArrayLike | None) -> Array:
+    """Unit vector against gravity [3]; y without gravity."""
+    down = np.array([0.0, -1.0, 0.0]) if gravity is None else vector("gravity", gravity, 3)
+    length = float(np.linalg.norm(down))
+    return np.array([0.0, 1.0, 0.0]) if length == 0 else -down / length
 
 
 def horizontal_axes(up: Array) -> tuple[Array, Array]:

@@ -67,20 +67,18 @@ def box_blur(field: Array, width: int, axes: tuple[int, ...], passes: int = 3) -
 
 @dataclass(frozen=True)
 class Skin:
-    """Surface of a cloud: vertices [V, 3] m, triangles int [T, 3], outward normals [V, 3], colours uint8 [V, 3].
-
-    `loose` is the mask [P] of particles outside it: drops too small for a surface.
-    """
+    """Surface of a cloud: vertices [V, 3] m, triangles int [T, 3], outward normals [V, 3], colours uint8 [V, 3]."""
 
     vertices: Array
     faces: Array
     normals: Array
     colors: Array
-    loose: Array
 
 
-def surface(x: Array, rgb: Array, spacing: float) -> Skin:
-    """Smooth surface of particles x [P, 3] m with colours uint8 [P, 3].
+def surface(x: Array, rgb: Array, spacing: float) -> tuple[Skin, Array]:
+    """Smooth surface of particles x [P, 3] m with colours uint8 [P, 3], and the mask [P] of particles outside of it.
+
+    Those are drops too small for a surface.
 
     Particle number density on a grid of one spacing, smoothed, cut at half its value in an undisturbed body
     (marching cubes; colours are the density-weighted mean of the particles').
@@ -98,7 +96,7 @@ def surface(x: Array, rgb: Array, spacing: float) -> Skin:
     color = field[..., 1:] / np.maximum(field[..., :1], 1e-3)
     vertices, faces, normals, colors = contour(field[..., 0], 0.5, spacing, lower, color)
     nearest = tuple(np.round((x - lower) / spacing).astype(np.int64).T)
-    return Skin(vertices, faces, normals, colors.clip(0, 255).astype(np.uint8), field[nearest][:, 0] < 0.25)
+    return Skin(vertices, faces, normals, colors.clip(0, 255).astype(np.uint8)), field[nearest][:, 0] < 0.25
 
 
 def contour(

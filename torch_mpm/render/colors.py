@@ -82,5 +82,5 @@ def map_colors(values: Array, limits: tuple[float, float], cmap: str) -> Array:
 
 def palette_colors(numbers: Array, palette: Sequence[str] = MATERIALS) -> Array:
     """uint8 [P, 3] for the numbers [P] of materials or layers; the palette repeats after its last colour."""
-    table = np.array([require("matplotlib.colors").to_rgb(c) for c in palette])
-    return (table[numbers.astype(np.int64) % len(palette)] * 255).round().astype(np.uint8)
+    table = np.array([list(bytes.fromhex(color[1:])) for color in palette], np.uint8)
+    return table[numbers.astype(np.int64) % len(palette)]

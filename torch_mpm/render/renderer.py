@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..surfaces.reconstruction import Surface
 from .annotate import blend, scale_overlay, scale_width, write_text
-from .camera import framing, light_directions
-from .cloud import rest_spacing
+from .camera import framing, light_directions, up_axis
+from .cloud import Skin, rest_spacing
 from .colors import PALETTES, PLAIN, QUANTITIES, Quantity, map_colors, numpy_of, palette_colors, scalar_of, value_range
 from .ground import Ground
 from .requires import RenderError, require
@@ -101,7 +102,7 @@ class Renderer:
         else:
             self.backend = _choose(backend)
             fill = (1 - 1.7 * scale_width(self.resolution) if color_by else 0.92, 0.86)
-            up = _up(gravity)
+            up = up_axis(gravity)
             camera = framing(*frame, up, self.resolution, azimuth, elevation, fill=fill)
             plate = Ground(*self.bounds, up, -light_directions(camera)[0]) if ground else None
             draws = Scene3D if self.backend == "vtk" else SoftwareScene
@@ -115,6 +116,7 @@ class Renderer:
         overlays: Sequence[Overlay] = (),
         time: float | None = None,
         title: str = "",
+        surfaces: Sequence[tuple[Surface, Any]] = (),
     ) -> Array:
         """One picture, uint8 [H, W, 3].
 
@@ -126,13 +128,18 @@ class Renderer:
             overlays: (points [N, D] in metres, colour, label) polylines over the picture.
             time: seconds, written into the picture.
             title: text at the top left.
+            surfaces: meshes to draw beside the particles (3-D), with the scalars of their vertices.
         """
         x = numpy_of(x)
         if x.ndim != 2 or x.shape[1] != self.dim:
             raise ValueError(f"x must have shape [P, {self.dim}], got {list(x.shape)}")
         if any(o.dim != self.dim for o in obstacles):
             raise ValueError(f"obstacles must have {self.dim} dimensions like the bounds")
-        rgb, limits = self._colors(scalars, len(x))
+        if surfaces and self.dim == 2:
+            raise ValueError("surfaces need three dimensions, and the bounds have two")
+        counts = [len(x), *(len(surface.vertices) for surface, _ in surfaces)]
+        (rgb, *tints), limits = self._colors([scalars, *(values for _, values in surfaces)], counts)
+        skins = [Skin(*surface, tint) for (surface, _), tint in zip(surfaces, tints, strict=True)]
         finite = np.isfinite(x).all(axis=1)
         if not finite.all():
             log.warning("%d of %d particles have no finite position and are not drawn", int((~finite).sum()), len(x))
@@ -144,7 +151,7 @@ class Renderer:
             if limits is not None:
                 self.scene.set_scale(self.quantity, limits, self.cmap)
             return self.scene.draw(x, rgb, radius, obstacles, overlays, self.names, title, stamp)
-        image = self.scene.draw(x, rgb, radius, self.style, obstacles)
+        image = self.scene.draw(x, rgb, radius, self.style, obstacles, skins)
         return self._annotate(image, overlays, limits, title, stamp)
 
     def fit_radius(self, x: Array) -> None:
@@ -170,17 +177,17 @@ class Renderer:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _colors(self, scalars: Any, count: int) -> tuple[Array, tuple[float, float] | None]:
-        """Colours uint8 [P, 3] and the range of the scale."""
+    def _colors(self, scalars: Sequence[Any], counts: Sequence[int]) -> tuple[list[Array], tuple[float, float] | None]:
+        """Colours uint8 [P, 3] of particles and of each surface, and the range of their common scale."""
         if self.color_by is None:
-            return np.tile((np.array(PLAIN) * 255).astype(np.uint8), (count, 1)), None
-        if scalars is None:
+            return [np.tile((np.array(PLAIN) * 255).astype(np.uint8), (count, 1)) for count in counts], None
+        if any(part is None for part in scalars):
             raise ValueError(f"scalars must be given for color_by={self.color_by!r}, got None")
-        values = scalar_of(self.color_by, numpy_of(scalars), count)
+        values = [scalar_of(self.color_by, numpy_of(s), n) for s, n in zip(scalars, counts, strict=True)]
         if self.color_by in PALETTES:
-            return palette_colors(values, PALETTES[self.color_by]), None
-        limits = self.limits or value_range(values, self.quantity.from_zero)
-        return map_colors(values, limits, self.cmap), limits
+            return [palette_colors(part, PALETTES[self.color_by]) for part in values], None
+        limits = self.limits or value_range(np.concatenate(values), self.quantity.from_zero)
+        return [map_colors(part, limits, self.cmap) for part in values], limits
 
     def _annotate(
         self, image: Array, overlays: Sequence[Overlay], limits: tuple[float, float] | None, title: str, stamp: str
@@ -207,12 +214,6 @@ def _box(name: str, box: tuple[npt.ArrayLike, npt.ArrayLike], dim: int | None) -
     if not np.all(lower < upper):
         raise ValueError(f"{name} must be (lower, upper) with lower < upper, got {lower.tolist()}, {upper.tolist()}")
     return lower, upper
-
-
-def _up(gravity: npt.ArrayLike | None) -> Array:
-    down = np.array([0.0, -1.0, 0.0]) if gravity is None else vector("gravity", gravity, 3)
-    length = float(np.linalg.norm(down))
-    return np.array([0.0, 1.0, 0.0]) if length == 0 else -down / length
 
 
 def _choose(backend: str) -> str:

@@ -80,25 +80,33 @@ class Scene3D:
         self.moving: list[Any] = []
         self.occlusion = occlusion
 
-    def draw(self, x: Array, rgb: Array, radius: float, style: str, obstacles: Sequence[Shape]) -> Array:
-        """The picture, uint8 [H, W, 3], of finite positions x [P, 3] m with colours uint8 [P, 3]."""
+    def draw(
+        self,
+        x: Array,
+        rgb: Array,
+        radius: float,
+        style: str,
+        obstacles: Sequence[Shape],
+        skins: Sequence[Skin] = (),
+    ) -> Array:
+        """The picture, uint8 [H, W, 3], of finite positions x [P, 3] m with colours uint8 [P, 3], and of surfaces."""
         for actor in self.moving:
             self.renderer.RemoveActor(actor)
         if self.occlusion and any(o.opacity < 1 for o in obstacles):
             self._add_passes(occlusion=False)  # It would darken objects behind glass in stripes.
             self.occlusion = False
         self.moving = [self._obstacle_actor(o) for o in obstacles]
+        self.moving += [self._surface_actor(skin) for skin in skins if len(skin.faces)]
         shown = visible(x, 2 * radius) if len(x) > CULL_FROM and style == "particles" else np.ones(len(x), dtype=bool)
         if len(x) and style == "surface":
-            skin = surface(x, rgb, 2 * radius)
+            skin, shown = surface(x, rgb, 2 * radius)
             self.moving.append(self._surface_actor(skin))
-            shown = skin.loose
         if len(x):
             self.moving.append(self._spheres_actor(x[shown], rgb[shown], radius))
         for actor in self.moving:
             self.renderer.AddActor(actor)
         if self.ground is not None:
-            self._shade_ground(x, radius, obstacles)
+            self._shade_ground(np.concatenate([x, *(skin.vertices for skin in skins)]), radius, obstacles)
         self.window.Render()
         return self._pixels()
 

@@ -159,14 +159,28 @@ def surface_samples(obstacle: Shape, count: int) -> Samples:
     """About `count` evenly spread points on an obstacle's triangles."""
     assert obstacle.faces is not None
     corners = obstacle.world()[obstacle.faces]
+    normals = _normals(corners)
+    normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    face, weights, radius = sample_triangles(corners, count)
+    return Samples(np.einsum("nk,nkd->nd", weights, corners[face]), normals[face], radius)
+
+
+def _normals(corners: Array) -> Array:
+    """Normals of triangles [T, 3, 3], twice as long as their areas."""
     edges = corners[:, 1:] - corners[:, :1]
-    normals = np.cross(edges[:, 0], edges[:, 1])
-    area = 0.5 * np.linalg.norm(normals, axis=1)
-    normals = normals / np.maximum(2 * area, 1e-300)[:, None]
+    normals: Array = np.cross(edges[:, 0], edges[:, 1])
+    return normals
+
+
+def sample_triangles(corners: Array, count: int) -> tuple[Array, Array, float]:
+    """About `count` evenly spread points on triangles [T, 3, 3]: the triangle of each [N], the weights of its corners
+    [N, 3], and the radius of the disc that it represents.
+    """
+    area = 0.5 * np.linalg.norm(_normals(corners), axis=1)
     per_face = np.ceil(count * area / max(float(area.sum()), 1e-300)).astype(np.int64)
     face = np.repeat(np.arange(len(area)), per_face)
     # The plastic number's sequence (Roberts 2018) fills the unit square evenly; folding maps it to the triangle.
     uv = np.arange(1, len(face) + 1)[:, None] * np.array([0.7548776662466927, 0.5698402909980532]) % 1
     uv = np.where(uv.sum(axis=1, keepdims=True) > 1, 1 - uv, uv)
-    points = corners[face, 0] + np.einsum("nk,nkd->nd", uv, edges[face])
-    return Samples(points, normals[face], float(np.sqrt(area.sum() / max(len(face), 1))))
+    weights = np.concatenate([1 - uv.sum(axis=1, keepdims=True), uv], axis=1)
+    return face, weights, float(np.sqrt(area.sum() / max(len(face), 1)))

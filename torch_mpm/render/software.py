@@ -1,6 +1,6 @@
 """Three-dimensional pictures without OpenGL: sphere splats with a depth buffer, in numpy.
 
-Plainer than VTK (no ambient occlusion, no smooth surface, jagged edges), for machines where nothing can be installed.
+Plainer than VTK (no ambient occlusion, jagged edges), for machines where nothing can be installed.
 """
 
 from __future__ import annotations
@@ -10,11 +10,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from .camera import LIGHTS, Camera, light_directions
-from .cloud import visible
+from .cloud import Skin, visible
 from .ground import BACKGROUND, Ground
 from .requires import require
-from .shapes import Array, Samples, Shape, surface_samples
+from .shapes import Array, Samples, Shape, sample_triangles, surface_samples
 
+SKIN_SAMPLES = 150_000
+"""Number of discs that draw the surfaces of a picture."""
 AMBIENT, DIFFUSE = 0.36, 0.85
 
 
@@ -31,19 +33,41 @@ def _screened(samples: Samples, opacity: float) -> Samples:
     return Samples(samples.points[kept], samples.normals[kept], samples.radius)
 
 
+def _skin_samples(skin: Skin, count: int) -> tuple[Samples, Array]:
+    """Discs on a surface with its smooth normals, and their colours [N, 3]."""
+    face, weights, radius = sample_triangles(skin.vertices[skin.faces], count)
+    corners = skin.faces[face]
+    points, normals, rgb = (
+        np.einsum("nk,nkd->nd", weights, values[corners]) for values in (skin.vertices, skin.normals, skin.colors)
+    )
+    return Samples(points, normals, radius), rgb
+
+
 class SoftwareScene:
     """Same interface as `Scene3D`; a `style` of "surface" is drawn as particles."""
 
     def __init__(self, camera: Camera, ground: Ground | None, bounds: tuple[Array, Array]) -> None:
         self.camera, self.ground, self.bounds = camera, ground, bounds
 
-    def draw(self, x: Array, rgb: Array, radius: float, style: str, obstacles: Sequence[Shape]) -> Array:
-        """The picture, uint8 [H, W, 3], of finite positions x [P, 3] m with colours uint8 [P, 3]."""
+    def draw(
+        self,
+        x: Array,
+        rgb: Array,
+        radius: float,
+        style: str,
+        obstacles: Sequence[Shape],
+        skins: Sequence[Skin] = (),
+    ) -> Array:
+        """The picture, uint8 [H, W, 3], of finite positions x [P, 3] m with colours uint8 [P, 3], and of surfaces."""
         samples = [_screened(surface_samples(o, count=40_000), o.opacity) for o in obstacles]
+        tint = [np.tile(np.array(o.color) * 255, (len(s.points), 1)) for o, s in zip(obstacles, samples, strict=True)]
+        for skin in skins:
+            discs, colors = _skin_samples(skin, SKIN_SAMPLES // len(skins))
+            samples.append(discs)
+            tint.append(colors)
         spread = [np.full(len(x), radius), *(np.full(len(s.points), s.radius) for s in samples)]
         image = self.backdrop(np.concatenate([x, *(s.points for s in samples)]), np.concatenate(spread))
         seen = visible(x, 2 * radius) if len(x) else np.zeros(0, dtype=bool)
-        tint = [np.tile(np.array(o.color) * 255, (len(s.points), 1)) for o, s in zip(obstacles, samples, strict=True)]
         # Samples of a surface are flat discs with its normal, a little larger than their share so that they overlap.
         points = np.concatenate([x[seen], *(s.points for s in samples)])
         radii = np.concatenate(

@@ -39,6 +39,7 @@ def problems(scene: Any, entries: Sequence[Any]) -> list[str]:
     ]
     for entry in entries:
         found += _material_problems(entry)
+    found += _surface_problems(scene, entries)
     found += _range_problems(scene)
     found += heat.problems(scene, entries)
     if scene.grid is not None:
@@ -174,10 +175,24 @@ def render_problems(scene: Any) -> Iterator[str]:
             yield f"render.view: takes a lower and an upper corner of {dim} numbers each, got {words.view}"
     if dim == 2 and words.style == "surface":
         yield "render.style: a surface needs three dimensions; this scene has two"
+    if dim == 2 and words.surface:
+        yield "render.surface: a surface needs three dimensions; this scene has two"
+    if words.surface and words.style == "surface":
+        yield "render.surface: takes style = 'particles', that of sand, got 'surface'"
     if dim == 3 and words.exaggeration != 1:
         yield f"render.exaggeration: is for 2-D scenes, got {words.exaggeration}"
     if words.ritter is not None and (dim == 3 or not any(scene.gravity or ())):
         yield "render.ritter: needs a 2-D scene with gravity"
+
+
+def _surface_problems(scene: Any, entries: Sequence[Any]) -> Iterator[str]:
+    """Pictures of surfaces in which nothing has one."""
+    if scene.render is None or not scene.render.surface:
+        return
+    items = [(entry, item) for entry in entries for kind in ("body", "emitter") for _, item in entry.keyed(kind)]
+    laws = [entry.material.get(item.material) for entry, item in items]
+    if laws and all(isinstance(law, schema.QuarticSand) for law in laws):
+        yield "render.surface: all materials are sand, which is drawn as particles"
 
 
 def _item_problems(key: str, item: Any, scene: Any) -> list[str]:

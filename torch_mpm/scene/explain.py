@@ -20,7 +20,7 @@ MOST_LETTERS = 1000
 """Maximum length of a problem in the message: values of files may be long."""
 UNWRITABLE = re.compile(r"\\u0000|[\ud800-\udfff]")
 """Null characters and lone surrogates in a JSON text."""
-BOOLEANS = ("deterministic", "volume_correction", "vtk", "ply", "video", "project", "obstacles", "fill")
+BOOLEANS = ("deterministic", "volume_correction", "vtk", "ply", "video", "project", "surface", "obstacles", "fill")
 """Keys of scene files and of [dataset] that are true or false."""
 
 

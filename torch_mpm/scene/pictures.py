@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -19,6 +19,7 @@ from .explain import SceneError
 from .fields import RANKS
 from .places import obstacle
 from .scene import Scene
+from .surfaces import GroupSurface, RunSurfaces
 
 FOLDER, VIDEO = "frames", "video.mp4"
 SAMPLES = 8
@@ -137,6 +138,7 @@ class _Artist:
             )
             for entry in self.entries
         ]
+        self.surfaces = RunSurfaces(self.scene, trajectory, origin=self.zero) if words.surface else None
         self._fit_radii(trajectory)
         drawn = scene.model_dump_json(), limits, [renderer.radius for renderer in self.renderers]
         self.way = hashlib.sha256(repr(drawn).encode()).hexdigest()
@@ -163,10 +165,14 @@ class _Artist:
         from ..render import contact_sheet
 
         time = float(frame["time"])
-        pictures = [self._one(k, frame, time) for k in range(len(self.entries))]
+        surfaces = [] if self.surfaces is None else self.surfaces.of_frame(frame)
+        pictures = [
+            self._one(k, frame, time, [found for found in surfaces if found.group.scene == k])
+            for k in range(len(self.entries))
+        ]
         return pictures[0] if len(pictures) == 1 else contact_sheet(pictures, self.columns, self.words.resolution[0])
 
-    def _one(self, k: int, frame: dict[str, Array], time: float) -> Array:
+    def _one(self, k: int, frame: dict[str, Array], time: float, surfaces: Sequence[GroupSurface]) -> Array:
         from ..render import obstacle_shapes
 
         entry = self.entries[k]
@@ -177,14 +183,24 @@ class _Artist:
             for shape in obstacle_shapes(obstacle(words, None), time, bounds)
         ]
         overlays = list(_ritter(self.scene, self.words.ritter, time)) if self.words.ritter else []
+        values, rows = self._values(frame), _rows(k, frame)
+        for found in surfaces:
+            rows &= ~found.rows
         return self.renderers[k].frame(
-            self._positions(k, frame),
-            self._values(frame)[_rows(k, frame)],
+            frame["position"][rows] - self.zero,
+            values[rows],
             obstacles=shapes,
             overlays=overlays,
             time=time,
             title=entry.name or self.scene.title,
+            surfaces=[(found.surface, self._at_vertices(found, values)) for found in surfaces],
         )
+
+    def _at_vertices(self, found: GroupSurface, values: Array) -> Array:
+        """Values of particles at the vertices of a surface; categories are not interpolated."""
+        from ..render.colors import PALETTES
+
+        return found.nearest(values) if self.words.color_by in PALETTES else found.mean(values)
 
     def _values(self, frame: dict[str, Array]) -> Array:
         if self.layers is not None:
@@ -209,9 +225,9 @@ class _Artist:
             renderer.close()
 
 
-def _rows(k: int, frame: dict[str, Array]) -> Any:
-    """Particles of a scene of the batch."""
-    return frame["scene"] == k if "scene" in frame else slice(None)
+def _rows(k: int, frame: dict[str, Array]) -> Array:
+    """Particles of a scene of the batch, bool [P]."""
+    return frame["scene"] == k if "scene" in frame else np.ones(len(frame["position"]), bool)
 
 
 def _layers(trajectory: Trajectory, scene: Scene, count: int) -> Array:

@@ -245,7 +245,9 @@ def override(words: dict[str, Any], text: str) -> None:
     target: Any = words
     try:
         for step in steps[:-1]:
-            target = target[int(step)] if isinstance(target, list) else target.setdefault(step, {})
+            if isinstance(target, dict) and target.get(step) is None:  # Absent, or null in the record of a run.
+                target[step] = {}
+            target = target[int(step)] if isinstance(target, list) else target[step]
         target[int(steps[-1]) if isinstance(target, list) else steps[-1]] = given
     except (KeyError, IndexError, ValueError, TypeError):
         raise SceneError([f"override {text!r}: there is no {key.strip()}"]) from None

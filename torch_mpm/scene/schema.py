@@ -544,6 +544,9 @@ class Render(Model):
     """ends of the colour scale; by default those of the whole run"""
     style: Literal["particles", "surface"] = "particles"
     """shaded particles, or a smooth surface around them (3-D)"""
+    surface: bool = False
+    """draw fluids and bodies, but not sand, as reconstructed surfaces (3-D), which needs the extra surface; those of
+    `torch-mpm surface` with its defaults"""
     resolution: Annotated[tuple[int, int], Field()] = (1280, 720)
     """width and height [pixels]"""
     azimuth: float = 28.0
