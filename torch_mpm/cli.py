@@ -1,5 +1,5 @@
-"""The command line: ``torch-mpm run SCENE -o DIR``, check, info, schema, render, export, surface, usd, splats, and those
-of data sets.
+"""The command line: ``torch-mpm run SCENE -o DIR``, check, info, schema, render, export, surface, usd, splats, and the
+commands of data sets.
 """
 
 from __future__ import annotations
