@@ -407,13 +407,11 @@ def raw_arguments(device: str) -> list:
         None,
         None,
         [],
-        None,
-        0,
-        0.5,
-        1,
         [],
-        0,
-        None,
+        [],
+        [],
+        [],
+        [],
         *grid.packed,
     )
     return [*particles, [state.mass * 0], scene, None, material, None, *laws, *how, *rest]

@@ -223,27 +223,12 @@ class _Calls:
         how = ([ones] * sum(counts), [0, 1, 0], 3, 1e-3, True, 0.0, True, 0, self.normal(2, D), *self.walls)
         impulse = self.normal(2, 6 + 2 * D, D + (1 if D == 2 else 3)).double()
         clocks = self.dt, self.uniform(2).double()
-        end = (*self.obstacles, 0.1, 2, 40, True, False, False, impulse, *clocks, [], None, 0, 0.5, 1, [], 0, None)
-        heat = [self.uniform(P), ones, ones, self.uniform(P), ones, 1 + self.uniform(2)]
-        hot = (
-            *self.obstacles,
-            0.1,
-            2,
-            40,
-            True,
-            True,
-            False,
-            None,
-            *clocks,
-            heat,
-            self.normal(P, D),
-            0,
-            1e-3,
-            9,
-            [1, 0],
-            1,
-            self.normal(2, 2),
-        )
+        nothing = ([], [], [], [], [], [])
+        end = (*self.obstacles, 0.1, 2, 40, True, False, False, impulse, *clocks, *nothing)
+        heat = [self.uniform(P), ones, ones, self.uniform(P), ones, 1 + self.uniform(2), self.normal(P, D)]
+        bounds = [self.normal(2, 2), self.uniform(3, 2, 2), self.uniform(P)]
+        conducts = (heat, [0, 9, 1], [1e-3, 273.0], [1, 0], [0, 1, 2], bounds)
+        hot = (*self.obstacles, 0.1, 2, 40, True, True, False, None, *clocks, *conducts)
         look = (*fields[:5], self.F, *self.uniform(4, P), self.scene, 50.0, 2.0, True, 0.1, self.lattice.upper, 2)
         start = (*fields, 0.5 + self.uniform(P), None, [self.uniform(P)], *who, *laws, *how)
         call, with_heat = ((*start, *parts, *self.lattice.packed) for parts in (end, hot))

@@ -20,6 +20,8 @@ MPM_BACKEND_KERNELS(MPM_HEAT_KERNELS)
   ORDERED(heat_to_nodes, HeatToNodesArguments)          \
   PLAIN(heat_means, HeatMeansArguments)                 \
   PLAIN(heat_largest, HeatLargestArguments)             \
+  ORDERED(heat_surface, HeatSurfaceArguments)           \
+  PLAIN(heat_terms, HeatTermsArguments)                 \
   PLAIN(heat_hold, HeatHoldArguments)                   \
   PLAIN(heat_layers, HeatLayersArguments)               \
   PLAIN(heat_from_surface, HeatFromSurfaceArguments)    \

@@ -68,6 +68,21 @@ MPM_HD HeatLayerAt<T> heat_layer(const T& distance, const T& width) {
   return {T(1) - rest * rest * rest, T(6) / (width * width) * rest * rest};
 }
 
+// Radiation of a surface with black = area ε σ into surroundings at a temperature, linearised about θ, both relative to
+// a reference [K]: the heat that enters is power − coefficient θ.
+template <class T>
+struct HeatRadiationAt {
+  T coefficient, power;
+};
+
+template <class T>
+MPM_HD HeatRadiationAt<T> heat_radiation(const T& black, const T& theta, const T& relative, const T& reference) {
+  const T ambient = relative + reference, kelvin = theta + reference;
+  const T hot = select(kelvin > T(0), kelvin, T(0)), square = hot * hot, slope = T(4) * square * hot;
+  const T coefficient = black * slope;
+  return {coefficient, coefficient * theta + black * (ambient * ambient * ambient * ambient - square * square)};
+}
+
 // Moves the excess of θ over the melting point into the latent heat, or out of it (enthalpy buffer; Stomakhin et al.
 // 2014). Returns the diffusion number r where the liquid fraction changes, else zero.
 template <class T>

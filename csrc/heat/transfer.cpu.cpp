@@ -84,6 +84,23 @@ void heat_to_nodes(const HeatToNodesArguments<T, D>& a) {
   for_outside(a.topology, [&](int64_t p) { at(a.conductance, p) = at(a.blend, p) = at(a.number, p) = T(0); });
 }
 
+template <int Order, class T, int D>
+void heat_surface(const HeatSurfaceArguments<T, D>& a) {
+  scatter_channels<Order, false, true>(
+      a.topology, a.x, a.sums, 0, kHeatChannels, [&]<int N>(const GroupOf<N>& g, const Pack<T, N>*, int scene) {
+        using P = Pack<T, N>;
+        const P volume = load(a.volume, g), slope = P(a.topology.geometry.inverse_dx) * volume;
+        Contribution<P, D> c;
+        MPM_UNROLL for (int k = 0; k < kChannels; k++) {
+          c.value[k] = P(0);
+          MPM_UNROLL for (int d = 0; d < D; d++)
+            c.slope[d][k] = P(0), c.gradient[d][k] = d == k ? slope : P(0);
+        }
+        if (a.power.pointer) c.value[kHeatChannels - 1] = volume * load(a.power, g, scene);
+        return c;
+      });
+}
+
 template <class T, int D>
 void heat_largest(const HeatLargestArguments<T, D>& a) {
   constexpr int64_t grain = 16384;  // particles below which a range is not split
@@ -173,6 +190,7 @@ void heat_to_particles(const HeatToParticlesArguments<T, D>& a) {
 
 MPM_INSTANTIATE(heat_volumes, HeatVolumesArguments)
 MPM_INSTANTIATE_ORDERS(heat_to_nodes, HeatToNodesArguments)
+MPM_INSTANTIATE_ORDERS(heat_surface, HeatSurfaceArguments)
 MPM_INSTANTIATE(heat_means, HeatMeansArguments)
 MPM_INSTANTIATE(heat_largest, HeatLargestArguments)
 MPM_INSTANTIATE(heat_increments, HeatIncrementsArguments)

@@ -118,6 +118,31 @@ struct HeatFromSurfaceArguments {
   T* source = nullptr;
 };
 
+// Sums for the free surface, |Σ V ∇N| of each node, and for heat from inside the matter.
+template <class T, int D>
+struct HeatSurfaceArguments {
+  Topology<T, D> topology;
+  Field<const T> x, volume;  // present volume
+  HeatValue<T> power;        // [W/m³]; without a pointer there is none
+  NodeField<T> sums;         // kHeatChannels, zero on entry: Σ V ∇N, and in the last one the power
+};
+
+enum class HeatTerm : int64_t { flux, convection, radiation };
+
+// Adds the terms of the free surface, and the power, to the exchange and the source of the nodes.
+template <class T, int D>
+struct HeatTermsArguments {
+  Topology<T, D> topology;
+  const T* sums = nullptr;   // of HeatSurfaceArguments
+  const T* theta = nullptr;  // of the nodes
+  int64_t count = 0, scenes = 1;
+  const int64_t* term = nullptr;  // HeatTerm [count]
+  const T* number = nullptr;      // [count, scenes, 2]: flux; or coefficient, or ε σ, and ambient temperature
+  double reference = 0;
+  T* exchange = nullptr;
+  T* source = nullptr;
+};
+
 // The largest of a value of the particles in each scene, NaN where one is NaN.
 template <class T, int D>
 struct HeatLargestArguments {

@@ -179,12 +179,10 @@ struct HeatRadiation {
   template <class T, int D>
   MPM_HD static void evaluate(Reader<T, D>& in, Writer<T, D>& out) {
     const T emitting = in.scalar(), black = emitting * in.scalar();
-    const T theta = in.scalar(), relative = in.scalar(), reference = in.scalar();
-    const T ambient = relative + reference, kelvin = theta + reference;
-    const T hot = select(kelvin > T(0), kelvin, T(0)), square = hot * hot, slope = T(4) * square * hot;
-    const T coefficient = black * slope;
-    out.put(coefficient);
-    out.put(coefficient * theta + black * (ambient * ambient * ambient * ambient - square * square));
+    const T theta = in.scalar(), ambient = in.scalar();
+    const HeatRadiationAt<T> radiation = heat_radiation(black, theta, ambient, in.scalar());
+    out.put(radiation.coefficient);
+    out.put(radiation.power);
   }
 };
 

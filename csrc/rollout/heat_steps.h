@@ -43,7 +43,10 @@ class HeatSteps {
     make_nodes();
     HeatToNodesArguments<T, D> down = to_nodes(x, mass, velocity_gradient);
     backend::heat_to_nodes(in_.lattice.order(), down, stream);
+    if (exchanges()) clear(exchange_), clear(source_);
     if (holds_surface()) add_layers(x, scene, stream);
+    means(stream);
+    if (has_terms()) add_terms(x, stream);
     solve(x, scene, stream);
     HeatToParticlesArguments<T, D> up = to_particles(down);
     backend::heat_to_particles(in_.lattice.order(), up, stream);
@@ -56,7 +59,15 @@ class HeatSteps {
   bool melts() const { return liquid_ >= 0; }
   int64_t held_nodes() const { return int64_t(in_.held_obstacles.size()) - holds_surface(); }
   // The last of the held obstacles is held at its surface, the others at the nodes in them.
-  bool holds_surface() const { return in_.held_surface != 0; }
+  bool holds_surface() const { return in_.heat_options[2] != 0; }
+  bool has_terms() const { return !in_.heat_terms.empty() || has_power(); }
+  // Tensors of the boundaries: held temperatures, numbers of the terms, power of the source; absent ones are empty.
+  enum Boundaries : size_t { kHeld, kNumbers, kPower, kBoundaries };
+  bool given(Boundaries k) const { return !in_.heat_boundaries.empty() && in_.heat_boundaries[k].numel() > 0; }
+  bool has_power() const { return given(kPower); }
+  // The gradient is the last tensor of `heat`.
+  bool has_gradient() const { return in_.heat.size() % 3 == 1; }
+  bool exchanges() const { return holds_surface() || has_terms(); }
   const T* held_temperature(int64_t k) const { return temperatures_.pointer + k * temperatures_.stride[0]; }
 
   template <class E>
@@ -70,6 +81,9 @@ class HeatSteps {
 
   void pack();
   void check_held();
+  void check_terms();
+  void means(backend::Stream stream);
+  void add_terms(const Field<const T>& x, backend::Stream stream);
   void add_layers(const Field<const T>& x, const Field<const int>& scene, backend::Stream stream);
   void hold_nodes(HeatArguments<T, D>& a, backend::Stream stream);
   void read_parameter(const Tensor& t, const char* name);
@@ -92,7 +106,8 @@ class HeatSteps {
   std::vector<double> bounds_;   // of the spectrum of each scene, see HeatArguments
   Field<const T> temperatures_;  // of the held obstacles [K, B]
   Tensor given_;                 // exchange of the particles
-  Tensor start_, fixed_, source_, exchange_;
+  Tensor start_, fixed_, source_, exchange_, surface_;
+  size_t power_ = 0;  // its number among the parameters
   int64_t slots_ = -1;
   Tensor sums_, theta_, capacity_, increment_, iterations_, residual_, converged_, workspace_;
 };
@@ -101,19 +116,27 @@ template <class T, int D>
 HeatSteps<T, D>::HeatSteps(Substeps<T, D>& steps) : s_(steps), in_(steps.in) {
   const Tensor& x = in_.x;
   const int64_t P = x.size(0);
-  STD_TORCH_CHECK(in_.heat.size() == 3 || in_.heat.size() == 6, "heat must be 3 or 6 tensors, got ", in_.heat.size());
-  STD_TORCH_CHECK(in_.heat_transfer >= 0 && in_.heat_transfer <= int64_t(HeatTransfer::pic),
-                  "heat_transfer must be 0 to 3, got ", in_.heat_transfer);
-  STD_TORCH_CHECK(in_.heat_iterations > 0 && in_.heat_iterations <= INT32_MAX, "heat_iterations must be positive, got ",
-                  in_.heat_iterations);
-  STD_TORCH_CHECK(in_.heat_tolerance > 0 && in_.heat_tolerance < 1, "heat_tolerance must be between 0 and 1, got ",
-                  in_.heat_tolerance);
+  const size_t tensors = in_.heat.size() - has_gradient();
+  STD_TORCH_CHECK(tensors == 3 || tensors == 6, "heat must be 3 or 6 tensors, and the gradient, got ", in_.heat.size());
+  STD_TORCH_CHECK(in_.heat_options.size() == 3, "heat_options must have 3 entries, got ", in_.heat_options.size());
+  STD_TORCH_CHECK(in_.heat_scalars.size() == 2, "heat_scalars must have 2 entries, got ", in_.heat_scalars.size());
+  STD_TORCH_CHECK(in_.heat_boundaries.empty() || in_.heat_boundaries.size() == kBoundaries,
+                  "heat_boundaries must be empty or 3 tensors, got ", in_.heat_boundaries.size());
+  STD_TORCH_CHECK(in_.heat_options[0] >= 0 && in_.heat_options[0] <= int64_t(HeatTransfer::pic),
+                  "the transfer of heat must be 0 to 3, got ", in_.heat_options[0]);
+  STD_TORCH_CHECK(in_.heat_options[1] > 0 && in_.heat_options[1] <= INT32_MAX,
+                  "the number of iterations must be positive, got ", in_.heat_options[1]);
+  STD_TORCH_CHECK(in_.heat_scalars[0] > 0 && in_.heat_scalars[0] < 1, "the tolerance must be between 0 and 1, got ",
+                  in_.heat_scalars[0]);
   STD_TORCH_CHECK(in_.wants_C, "heat needs wants_C");
   STD_TORCH_CHECK(s_.p2g.form == StressForm::mls, "heat needs the stress form mls");
   pack();
   check_held();
+  check_terms();
   for (const size_t k : {1, 2, 4, 5})
-    if (k < in_.heat.size()) read_parameter(in_.heat[k], element("heat", int(k)).c_str());
+    if (k < tensors) read_parameter(in_.heat[k], element("heat", int(k)).c_str());
+  power_ = values_.size();
+  if (has_power()) read_parameter(in_.heat_boundaries[kPower], "the power of heat");
   conductance_ = empty(x, {P});
   blend_ = empty(x, {P});
   number_ = empty(x, {P});
@@ -131,8 +154,8 @@ void HeatSteps<T, D>::pack() {
   const Tensor& x = in_.x;
   const int64_t P = x.size(0);
   int columns = 1;
-  if (has(in_.temperature_gradient)) gradient_ = columns, columns += D;
-  if (in_.heat.size() == 6) liquid_ = columns++;
+  if (has_gradient()) gradient_ = columns, columns += D;
+  if (in_.heat.size() >= 6) liquid_ = columns++;
   volume_ = columns++;
   Tensor packed = empty_particles(x, {P, columns});
   torch::stable::zero_(packed);
@@ -143,7 +166,7 @@ void HeatSteps<T, D>::pack() {
     torch::stable::copy_(part, torch::stable::reshape(t, {P, width}));
   };
   put(in_.heat[0], "heat[0]", 0, 1);
-  if (gradient_ >= 0) put(*in_.temperature_gradient, "temperature_gradient", gradient_, D);
+  if (gradient_ >= 0) put(in_.heat.back(), "the temperature gradient", gradient_, D);
   if (melts()) put(in_.heat[3], "heat[3]", liquid_, 1);
   fields = OwnField<T>(packed);
 }
@@ -151,15 +174,15 @@ void HeatSteps<T, D>::pack() {
 template <class T, int D>
 void HeatSteps<T, D>::check_held() {
   const int64_t count = int64_t(in_.held_obstacles.size());
-  STD_TORCH_CHECK(has(in_.held_temperatures) == (count > 0), "held_obstacles needs held_temperatures");
-  STD_TORCH_CHECK(count > 0 || !holds_surface(), "held_surface needs held_obstacles");
+  STD_TORCH_CHECK(given(kHeld) == (count > 0), "held_obstacles needs temperatures in heat_boundaries");
+  STD_TORCH_CHECK(count > 0 || !holds_surface(), "a held surface needs held_obstacles");
   if (count == 0) return;
   for (const int64_t k : in_.held_obstacles)
     STD_TORCH_CHECK(k >= 0 && k < s_.contact.obstacles, "held_obstacles must be 0 to ", s_.contact.obstacles - 1,
                     ", got ", k);
-  check_shape(*in_.held_temperatures, "held_temperatures", {count, in_.scenes});
-  check_like(*in_.held_temperatures, "held_temperatures", in_.x);
-  temperatures_ = field<const T>(*in_.held_temperatures);
+  check_shape(in_.heat_boundaries[kHeld], "the held temperatures", {count, in_.scenes});
+  check_like(in_.heat_boundaries[kHeld], "the held temperatures", in_.x);
+  temperatures_ = field<const T>(in_.heat_boundaries[kHeld]);
   if (holds_surface()) given_ = empty(in_.x, {particles(), 1});
 }
 
@@ -180,8 +203,6 @@ void HeatSteps<T, D>::add_layers(const Field<const T>& x, const Field<const int>
   a.conductance = field<T>(conductance_);
   a.exchange = column(field<T>(given_), 0);
   backend::heat_layers(a, stream);
-  clear(exchange_);
-  clear(source_);
   T* const exchange = static_cast<T*>(exchange_.data_ptr());
   ScatterArguments<T, D> down;
   down.topology = s_.p2g.topology;
@@ -241,7 +262,8 @@ void HeatSteps<T, D>::make_nodes() {
     capacity_ = empty(in_.x, {nodes});
     increment_ = empty(in_.x, {nodes});
     if (held_nodes() > 0) start_ = empty(in_.x, {nodes}), fixed_ = empty(in_.x, {nodes}, ScalarType::Bool);
-    if (holds_surface()) exchange_ = empty(in_.x, {nodes}), source_ = empty(in_.x, {nodes});
+    if (exchanges()) exchange_ = empty(in_.x, {nodes}), source_ = empty(in_.x, {nodes});
+    if (has_terms()) surface_ = empty(in_.x, {nodes, kHeatChannels});
     workspace_ = Tensor();
   }
   clear(sums_);
@@ -258,7 +280,7 @@ HeatToNodesArguments<T, D> HeatSteps<T, D>::to_nodes(const Field<const T>& x, co
   a.particles = given();
   a.conductivity = value(0);
   a.specific_heat = value(1);
-  a.transfer = HeatTransfer(in_.heat_transfer);
+  a.transfer = HeatTransfer(in_.heat_options[0]);
   a.scene_dt = s_.p2g.scene_dt;
   a.dt = in_.dt;
   a.conductance = field<T>(conductance_);
@@ -300,12 +322,57 @@ void HeatSteps<T, D>::find_largest(const Field<const T>& of, const Field<const i
 }
 
 template <class T, int D>
+void HeatSteps<T, D>::means(backend::Stream stream) {
+  backend::heat_means(
+      HeatMeansArguments<T, D>{slots_ * kBlockNodes<D>, static_cast<T*>(sums_.data_ptr()),
+                               static_cast<T*>(theta_.data_ptr()), static_cast<T*>(capacity_.data_ptr())},
+      stream);
+}
+
+template <class T, int D>
+void HeatSteps<T, D>::check_terms() {
+  const int64_t count = int64_t(in_.heat_terms.size());
+  STD_TORCH_CHECK(given(kNumbers) == (count > 0), "heat_terms needs numbers in heat_boundaries");
+  for (const int64_t term : in_.heat_terms)
+    STD_TORCH_CHECK(term >= 0 && term <= int64_t(HeatTerm::radiation), "heat_terms must be 0 to 2, got ", term);
+  if (count == 0) return;
+  check_shape(in_.heat_boundaries[kNumbers], "the numbers of heat_terms", {count, in_.scenes, 2});
+  check_like(in_.heat_boundaries[kNumbers], "the numbers of heat_terms", in_.x);
+  STD_TORCH_CHECK(in_.heat_boundaries[kNumbers].is_contiguous(), "the numbers of heat_terms must be contiguous");
+}
+
+// The terms of the free surface, and the heat from inside the matter.
+template <class T, int D>
+void HeatSteps<T, D>::add_terms(const Field<const T>& x, backend::Stream stream) {
+  clear(surface_);
+  T* const sums = static_cast<T*>(surface_.data_ptr());
+  HeatSurfaceArguments<T, D> down;
+  down.topology = s_.p2g.topology;
+  down.x = x;
+  down.volume = given().volume;
+  if (has_power()) down.power = value(power_);
+  down.sums = {sums, kHeatChannels, kHeatChannels};
+  backend::heat_surface(in_.lattice.order(), down, stream);
+  HeatTermsArguments<T, D> a;
+  a.topology = s_.p2g.topology;
+  a.sums = sums;
+  a.theta = field<const T>(theta_).pointer;
+  a.count = int64_t(in_.heat_terms.size());
+  a.scenes = in_.scenes;
+  a.term = in_.heat_terms.data();
+  if (a.count > 0) a.number = static_cast<const T*>(in_.heat_boundaries[kNumbers].data_ptr());
+  a.reference = in_.heat_scalars[1];
+  a.exchange = static_cast<T*>(exchange_.data_ptr());
+  a.source = static_cast<T*>(source_.data_ptr());
+  backend::heat_terms(a, stream);
+}
+
+template <class T, int D>
 void HeatSteps<T, D>::solve(const Field<const T>& x, const Field<const int>& scene, backend::Stream stream) {
   const int64_t nodes = slots_ * kBlockNodes<D>;
   T* const sums = static_cast<T*>(sums_.data_ptr());
   T* const theta = static_cast<T*>(theta_.data_ptr());
   T* const capacity = static_cast<T*>(capacity_.data_ptr());
-  backend::heat_means(HeatMeansArguments<T, D>{nodes, sums, theta, capacity}, stream);
   HeatArguments<T, D> a;
   a.topology = s_.p2g.topology;
   a.x = x;
@@ -315,8 +382,8 @@ void HeatSteps<T, D>::solve(const Field<const T>& x, const Field<const int>& sce
   a.dt = in_.dt;
   a.scene_dt = s_.p2g.scene_dt.pointer;
   a.tolerance = kNegligibleResidual;
-  a.relative_tolerance = in_.heat_tolerance;
-  a.most = int(in_.heat_iterations);
+  a.relative_tolerance = in_.heat_scalars[0];
+  a.most = int(in_.heat_options[1]);
   // With W = M/dt, u · H u ≤ Σ K_i u_i² and K_i = D⁻¹ Σ_p κ_p V_p N_i ≤ D⁻¹ dx² max_p r_p W_i (csrc/heat/cell.h).
   std::fill(bounds_.begin(), bounds_.end(), 0.0);
   find_largest(field<const T>(number_), scene, bounds_.data(), 1, stream);
@@ -324,7 +391,7 @@ void HeatSteps<T, D>::solve(const Field<const T>& x, const Field<const int>& sce
   a.scene_bound = bounds_.data();
   a.deterministic = in_.lattice.deterministic();
   if (held_nodes() > 0) hold_nodes(a, stream);
-  if (holds_surface()) a.exchange = field<const T>(exchange_).pointer, a.source = field<const T>(source_).pointer;
+  if (exchanges()) a.exchange = field<const T>(exchange_).pointer, a.source = field<const T>(source_).pointer;
   a.increment = static_cast<T*>(increment_.data_ptr());
   a.iterations = static_cast<int*>(iterations_.data_ptr());
   a.residual = static_cast<T*>(residual_.data_ptr());

@@ -189,6 +189,53 @@ def test_held_obstacles_of_scenes(dt):
     compare(held(step, *terms), state, 10, dt)
 
 
+def terms(scenes=1, particles=0):
+    surface = heat_boundaries.FreeSurface()
+    each = torch.linspace(1, 2, scenes, dtype=torch.float64)
+    return {
+        "flux": [heat_boundaries.Flux(surface, 4e6 * each if scenes > 1 else 4e6)],
+        "convection": [heat_boundaries.Convection(surface, 3e4, 40.0 * each if scenes > 1 else -20.0)],
+        "radiation": [heat_boundaries.Radiation(surface, 0.9, 3000.0)],
+        "source": [heat_boundaries.Source(2e8 * (torch.ones(particles).double() if particles else each[:1]))],
+    }
+
+
+@pytest.mark.parametrize("with_held", [False, True])
+@pytest.mark.parametrize("name", [*terms(), "all"])
+def test_free_surface_and_sources(dim, name, with_held):
+    """Terms of boundaries, alone, together and beside obstacles that hold a temperature."""
+    step, state = scene(dim, melts=True)
+    step.heat.reference = 290.0
+    chosen = [t for own in terms().values() for t in own] if name == "all" else terms()[name]
+    step.heat.boundaries = chosen
+    if with_held:
+        region, plate = bodies(dim)["sphere"], bodies(dim)["plane"]
+        step = held(step, (heat_boundaries.FixedSurface, region, 40.0), (heat_boundaries.Fixed, plate, -5.0))
+        step.heat.boundaries = [*chosen, *step.heat.boundaries.entries]
+    end = compare(step, state, 6)
+    step.heat.boundaries = [b for b in step.heat.boundaries.entries if b not in chosen]
+    without = compare(step, state, 6)
+    assert float((end.temperature - without.temperature).abs().max()) > 1e-3
+
+
+@pytest.mark.parametrize("per_particle", [False, True])
+def test_free_surface_and_sources_of_scenes(per_particle):
+    step, state = scene(2, scenes=3)
+    step.heat.reference = 290.0
+    step.heat.boundaries = [term for own in terms(3, len(state) if per_particle else 0).values() for term in own]
+    compare(step, state, 6, torch.tensor([1.0, 2.0, 0.5], dtype=torch.float64) * DT)
+
+
+def test_heat_of_a_source_is_its_energy():
+    """Without another boundary the content grows by power times volume times time."""
+    step, state = scene(3)
+    step.heat.boundaries = [heat_boundaries.Source(2e8)]
+    with torch.no_grad():
+        end = mpm.rollout(step, state, 1, DT)
+    grown = (step.heat.heat_content(end) - step.heat.heat_content(state)).sum()
+    assert float(grown) == pytest.approx(2e8 * float(state.volume.sum()) * DT, rel=1e-9)
+
+
 @pytest.mark.parametrize("bounds", [[4e-7], [8e-4], [2e-2], [4e-7, 8e-4, 2e-2], [8e-4, 2e-2, 4e-7]])
 def test_short_solves_reach_the_tolerance(dim, bounds):
     """Changes of temperature at bounds of the spectrum that need one, two or more steps of the solver, against solves
@@ -254,12 +301,24 @@ def test_lagging_fronts_are_reported():
     torch.testing.assert_close(*numbers)
 
 
+class Mine:
+    def apply(self, nodes):
+        pass
+
+
 def _of_function(step):
     step.heat.conductivity = lambda theta: 1 + theta * 0
 
 
 REFUSED = {
-    "a boundary that is not held, Source": lambda s: setattr(s.heat, "boundaries", [heat_boundaries.Source(1.0)]),
+    "a boundary of the user": lambda s: setattr(s.heat, "boundaries", [Mine()]),
+    "there are several sources": lambda s: setattr(s.heat, "boundaries", [heat_boundaries.Source(1.0)] * 2),
+    "Flux acts on points": lambda s: setattr(
+        s.heat, "boundaries", [heat_boundaries.Flux(heat_boundaries.Surface(torch.full((1, 2), 0.4), 0.1), 1.0)]
+    ),
+    "flux of Flux is a function": lambda s: setattr(
+        s.heat, "boundaries", [heat_boundaries.Flux(heat_boundaries.FreeSurface(), lambda t: 1.0)]
+    ),
     "is no obstacle of the step": lambda s: setattr(
         s.heat, "boundaries", [heat_boundaries.Fixed(mpm.Sphere((0.4, 0.4), 0.1), 1.0)]
     ),
@@ -309,28 +368,41 @@ def test_raw_op():
         heat = torch.ops.torch_mpm.substeps(**arguments)[-3]
         assert torch.equal(heat[:, 0], mpm.rollout(step, state, 4, DT).temperature)
     torch.library.opcheck(torch.ops.torch_mpm.substeps, tuple(arguments.values()), test_utils="test_faketensor")
+    heat, none = arguments["heat"], torch.empty(0, dtype=torch.float64)
+    ones = torch.ones(7, dtype=torch.float64)
     wrong = {
-        "heat must be 3 or 6 tensors": {"heat": arguments["heat"][:2]},
-        "heat.1. must be a scalar or have shape": {
-            "heat": [arguments["heat"][0], torch.ones(7).double(), *arguments["heat"][2:]]
-        },
-        "heat.0. must have shape": {"heat": [arguments["heat"][0][1:], *arguments["heat"][1:]]},
-        "temperature_gradient must have shape": {"temperature_gradient": state.x[1:]},
-        "heat_transfer must be 0 to 3, got 4": {"heat_transfer": 4},
-        "heat_tolerance must be between 0 and 1": {"heat_tolerance": 1.0},
-        "heat_iterations must be positive": {"heat_iterations": 0},
+        "heat must be 3 or 6 tensors": {"heat": heat[:2]},
+        "heat.1. must be a scalar or have shape": {"heat": [heat[0], ones, *heat[2:]]},
+        "heat.0. must have shape": {"heat": [heat[0][1:], *heat[1:]]},
+        "the temperature gradient must have shape": {"heat": [*heat[:-1], state.x[1:]]},
+        "heat_options must have 3 entries, got 2": {"heat_options": [0, 1]},
+        "heat_scalars must have 2 entries, got 1": {"heat_scalars": [0.5]},
+        "transfer of heat must be 0 to 3, got 4": {"heat_options": [4, 9, 0]},
+        "tolerance must be between 0 and 1": {"heat_scalars": [1.0, 0.0]},
+        "iterations must be positive": {"heat_options": [0, 0, 0]},
         "heat needs wants_C": {"wants_C": False, "apic": False},
         "without gradients": {"resident": False},
+        "heat_boundaries must be empty or 3 tensors, got 2": {"heat_boundaries": [none, none]},
         "held_obstacles must be 0 to 0, got 1": {
             "held_obstacles": [1],
-            "held_temperatures": torch.ones(1, 1).double(),
+            "heat_boundaries": [ones[:1, None], none, none],
         },
-        "held_obstacles needs held_temperatures": {"held_obstacles": [0]},
-        "held_surface needs held_obstacles": {"held_surface": 1},
-        "held_temperatures must have shape .1, 1.": {
+        "held_obstacles needs temperatures": {"held_obstacles": [0]},
+        "held surface needs held_obstacles": {"heat_options": [0, 9, 1]},
+        "held temperatures must have shape .1, 1.": {
             "held_obstacles": [0],
-            "held_temperatures": torch.ones(2, 1).double(),
+            "heat_boundaries": [ones[:2, None], none, none],
         },
+        "heat_terms must be 0 to 2, got 3": {
+            "heat_terms": [3],
+            "heat_boundaries": [none, ones[:2].view(1, 1, 2), none],
+        },
+        "heat_terms needs numbers": {"heat_terms": [0]},
+        "numbers of heat_terms must have shape .1, 1, 2.": {
+            "heat_terms": [0],
+            "heat_boundaries": [none, ones[:2].view(1, 2), none],
+        },
+        "power of heat must be a scalar or have shape": {"heat_boundaries": [none, none, ones]},
     }
     for message, change in wrong.items():
         with pytest.raises(RuntimeError, match=message):

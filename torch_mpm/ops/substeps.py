@@ -3,9 +3,8 @@
     torch.ops.torch_mpm.substeps(x, v, mass, volume, C, F, J, residual, history, scene, ids, material, previous_status,
         laws, options, parameters, variables, n, dt, apic, flip, wants_C, stress_form, gravity, wall_kind, wall_plane,
         wall_friction, obstacles, data, shape, sizes, contact, obstacle_scene, start, end, time, scenes,
-        max_blocks, grows, resident, records, impulse, scene_dt, scene_time, heat, temperature_gradient,
-        heat_transfer, heat_tolerance, heat_iterations, held_obstacles, held_surface, held_temperatures, lattice,
-        layout, schedule=-1)
+        max_blocks, grows, resident, records, impulse, scene_dt, scene_time, heat, heat_options, heat_scalars,
+        held_obstacles, heat_terms, heat_boundaries, lattice, layout, schedule=-1)
         -> (x, v, C, F, J, history, status, impulse, time, residual, heat, heat_status, record)
 
 `torch_mpm.substeps_arguments(step, state, n, dt)` returns the arguments; docs/training.md has an example.
@@ -26,12 +25,16 @@ scene; sums, also those of gradients, may then round differently. With `records`
 is `State.x_residual`; without it positions are not compensated.
 
 Heat is conducted where `heat` is not empty, on the CPU and without gradients: temperature [P], conductivity and
-specific heat, and, for materials that melt, liquid fraction [P], melting point and latent heat; parameters are [], [1],
-[B] or [P]. `heat_transfer` is a number in `TRANSFERS` of torch_mpm.heat, `temperature_gradient` [P, D] belongs to the
-first two. `held_obstacles` are numbers of obstacles that hold the nodes in them at `held_temperatures` [K, B]; with
-`held_surface` the last of them holds its surface. The result `heat` [P, m] has temperature, gradient and liquid
-fraction in its first columns, `heat_status` [B, 3] the number of solves that missed the tolerance, their largest
-residual [K], and the largest diffusion number of particles whose liquid fraction changed.
+specific heat; for materials that melt also liquid fraction [P], melting point and latent heat; and last, for the first
+two numbers in `TRANSFERS` of torch_mpm.heat, the temperature gradient [P, D]. Parameters are [], [1], [B] or [P].
+`heat_options` are the number of the transfer, the maximum number of iterations, and whether the last of the
+`held_obstacles` holds its surface (1) instead of the nodes in it; `heat_scalars` are tolerance and reference [K].
+`heat_terms` of the free surface are 0 for a flux, 1 for convection and 2 for radiation. `heat_boundaries` are the
+temperatures of the held obstacles [K, B], two numbers of each term [K, B, 2] (flux, coefficient or emissivity times the
+constant of Stefan and Boltzmann; and ambient temperature), and the power of a source [W/m³]; absent ones have the shape
+[0]. The result `heat` [P, m] has temperature, gradient and liquid fraction in its first columns, `heat_status` [B, 3]
+the number of solves that missed the tolerance, their largest residual [K], and the largest diffusion number of
+particles whose liquid fraction changed.
 
 `schedule` is the number of a schedule in the order of csrc/rollout/plan.h; -1 chooses the fastest. A schedule that does
 not support the call is an error with the reason; its sums may round differently.
@@ -124,7 +127,8 @@ def _fake(
 
 def _columns_of_heat(given: dict[str, Any], dim: int) -> int:
     """Temperature, gradient, liquid fraction and present volume."""
-    return 2 + (0 if given["temperature_gradient"] is None else dim) + (len(given["heat"]) > 3)
+    count = len(given["heat"])
+    return 2 + (dim if count % 3 == 1 else 0) + (count >= 6)
 
 
 def _fake_record(x: Tensor) -> Tensor:
@@ -182,6 +186,7 @@ def _backward(ctx: Any, *grads: Any) -> Any:
     op = torch.ops.torch_mpm.substeps_backward
     adjoints = interruptible(dispatch, op, *grads[:6], by_impulse, needs, record, *arguments)
     found = dict(zip(_ADJOINTS, adjoints, strict=True)) | {"impulse": grads[7], "heat": [None] * len(given["heat"])}
+    found["heat_boundaries"] = [None] * len(given["heat_boundaries"])
     found["history"] = _of_history(found["history"], history, wanted["history"])
     found["parameters"] = _of_parameters(found["parameters"], parameters, wanted["parameters"], given["scene"])
     by_dt = found.pop("dt")
@@ -195,7 +200,7 @@ def _backward(ctx: Any, *grads: Any) -> Any:
         found["gravity"] = dt * change
         if wants_dt:
             found["scene_dt"] = found["scene_dt"] + given["dt"] * (given["gravity"] * change).sum(1)
-    lists = ("history", "parameters", "heat")
+    lists = ("history", "parameters", "heat", "heat_boundaries")
     return tuple(found.get(name) if name in lists or wanted[name] is True else None for name in _SCHEMA)
 
 

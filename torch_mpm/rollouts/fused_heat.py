@@ -8,7 +8,16 @@ import torch
 from torch import Tensor
 
 from ..errors import shape_of
-from ..heat.boundaries import Fixed, FixedSurface
+from ..heat.boundaries import (
+    STEFAN_BOLTZMANN,
+    Convection,
+    Fixed,
+    FixedSurface,
+    Flux,
+    FreeSurface,
+    Radiation,
+    Source,
+)
 from ..heat.heat import GRADIENT, TRANSFERS, Heat
 from ..laws.parameters import PerMaterial, check_length, evaluate, needed_temperature
 from ..laws.thermal import LIQUID
@@ -27,7 +36,7 @@ def why_not_fused_heat(step: Step, state: State, dt: float | Tensor) -> str | No
         return f"{type(heat).__name__} may do more than a Heat"
     if heat.grid is not step.grid:
         return "its heat has another grid"
-    if (reason := _why_not_held(step, heat)) is not None:
+    if (reason := _why_not_boundaries(step, heat)) is not None:
         return reason
     if heat.method != "cg":
         return f"its heat is solved by {heat.method}"
@@ -47,44 +56,85 @@ def why_not_fused_heat(step: Step, state: State, dt: float | Tensor) -> str | No
     return None
 
 
-def _why_not_held(step: Step, heat: Heat) -> str | None:
-    """Reason why the op does not hold the temperatures of the boundaries; None if it does."""
-    for term in heat.boundaries.entries:
-        name = type(term).__name__
-        if type(term) not in (Fixed, FixedSurface):
-            return f"its heat has a boundary that is not held, {name}"
-        if not any(term.region is obstacle for obstacle in step.boundaries.entries):
-            return f"the region of {name} is no obstacle of the step"
-        value = term.temperature
-        if _is_function(value) or (isinstance(value, Tensor) and value.requires_grad):
-            return f"the temperature of {name} is a function, or requires a gradient"
-    if sum([type(term) is FixedSurface for term in heat.boundaries.entries]) > 1:
-        return "several surfaces are held"
+HELD = (Fixed, FixedSurface)
+NUMBERS: dict[type, tuple[str, ...]] = {
+    Flux: ("flux",),
+    Convection: ("coefficient", "ambient"),
+    Radiation: ("emissivity", "ambient"),
+}
+"""Terms of the free surface, in the order of csrc/heat/transfer.h, and their numbers."""
+
+
+def _why_not_boundaries(step: Step, heat: Heat) -> str | None:
+    """Reason why the op does not support the boundaries of the heat; None if it does."""
+    terms = heat.boundaries.entries
+    for term in terms:
+        if type(term) not in (*HELD, *NUMBERS, Source):
+            return f"its heat has a boundary of the user, {type(term).__name__}"
+        if type(term) in HELD and not any(term.region is obstacle for obstacle in step.boundaries.entries):
+            return f"the region of {type(term).__name__} is no obstacle of the step"
+        if type(term) in NUMBERS and type(term.surface) is not FreeSurface:
+            return f"{type(term).__name__} acts on points of a surface"
+        for name in _names(term):
+            value = getattr(term, name)
+            if _is_function(value) or (isinstance(value, Tensor) and value.requires_grad):
+                return f"{name} of {type(term).__name__} is a function, or requires a gradient"
+            if type(term) in NUMBERS and isinstance(value, Tensor) and value.numel() not in (1, heat.grid.scenes):
+                return f"{name} of {type(term).__name__} has a value for each node"
+    for kind, reason in ((FixedSurface, "several surfaces are held"), (Source, "there are several sources of heat")):
+        if sum([type(term) is kind for term in terms]) > 1:
+            return reason
     return None
 
 
-def _held(step: Step, x: Tensor) -> tuple[list[int], int, Tensor | None]:
+def _names(term: Any) -> tuple[str, ...]:
+    """Names of the numbers of a boundary."""
+    return ("temperature",) if type(term) in HELD else NUMBERS.get(type(term), ("power",))
+
+
+def _terms(heat: Heat, state: State) -> tuple[list[int], Tensor, Tensor]:
+    """Terms of the free surface and their numbers [K, B, 2], and the power of the source; empty where absent."""
+    terms, like, scenes = heat.boundaries.entries, state.mass, heat.grid.scenes
+    kinds = list(NUMBERS)
+    rows = []
+    surfaces = [term for term in terms if type(term) in NUMBERS]
+    for term in surfaces:
+        values = [per_scene(name, getattr(term, name), like, scenes) for name in _names(term)]
+        if type(term) is Radiation:
+            values[0] = STEFAN_BOLTZMANN * values[0]
+        rows.append(torch.stack([values[0], values[-1]], 1))
+    power = next((term.power for term in terms if type(term) is Source), None)
+    if power is not None:
+        check_length("power", power, len(state), scenes)
+        power = evaluate("power", power, state) if isinstance(power, PerMaterial) else power
+    of_source = like.new_empty(0) if power is None else torch.as_tensor(power, dtype=like.dtype, device=like.device)
+    numbers = torch.stack(rows).contiguous() if rows else like.new_empty(0)
+    return [kinds.index(type(term)) for term in surfaces], numbers, of_source
+
+
+def _held(step: Step, x: Tensor) -> tuple[list[int], int, Tensor]:
     """Numbers of the obstacles that hold a temperature, that of a `FixedSurface` last; whether there is one; and the
     temperatures [K, B]."""
     assert step.heat is not None
-    terms = sorted(step.heat.boundaries.entries, key=lambda term: type(term) is FixedSurface)
+    held = [term for term in step.heat.boundaries.entries if type(term) in HELD]
+    terms = sorted(held, key=lambda term: type(term) is FixedSurface)
     if not terms:
-        return [], 0, None
+        return [], 0, x.new_empty(0)
     scenes, obstacles = step.grid.scenes, step.boundaries.entries
     numbers = [next(k for k, o in enumerate(obstacles) if o is term.region) for term in terms]
-    rows = [held_temperatures(term.temperature, x, scenes) for term in terms]
+    rows = [per_scene("temperature", term.temperature, x, scenes) for term in terms]
     return numbers, int(type(terms[-1]) is FixedSurface), torch.stack(rows)
 
 
-def held_temperatures(value: Any, like: Tensor, scenes: int) -> Tensor:
-    """A temperature for each scene [B].
+def per_scene(name: str, value: Any, like: Tensor, scenes: int) -> Tensor:
+    """A value for each scene [B].
 
     Raises:
         ValueError: for another shape.
     """
     given = torch.as_tensor(value, dtype=like.dtype, device=like.device)
     if given.shape not in ((), (1,), (scenes,)):
-        raise ValueError(f"temperature must have shape [], [1] or [B] = [{scenes}], got {shape_of(given)}")
+        raise ValueError(f"{name} must have shape [], [1] or [B] = [{scenes}], got {shape_of(given)}")
     return given.detach().reshape(-1).expand(scenes)
 
 
@@ -106,10 +156,10 @@ def _fields(heat: Heat, state: State) -> tuple[Tensor | None, ...]:
 
 
 def heat_arguments(step: Step, state: State) -> tuple[Any, ...]:
-    """The arguments of the op from `heat` to `held_temperatures`."""
+    """The arguments of the op from `heat` to `heat_boundaries`."""
     heat = step.heat
     if heat is None:
-        return [], None, 0, 0.5, 1, [], 0, None
+        return [], [], [], [], [], []
     temperature, scenes = needed_temperature(state), heat.grid.scenes
     names = ("conductivity", "specific_heat", "melting_point", "latent_heat")
     values = []
@@ -118,9 +168,13 @@ def heat_arguments(step: Step, state: State) -> tuple[Any, ...]:
         number = evaluate(name, value, state) if isinstance(value, PerMaterial) else value
         values.append(torch.as_tensor(number, dtype=temperature.dtype, device=temperature.device))
     melting = [state.extra[LIQUID], *values[2:]] if heat.melts else []
-    gradient = state.extra[GRADIENT] if heat.affine else None
-    how = TRANSFERS.index(heat.transfer), heat.tolerance, heat.max_iterations
-    return [temperature, *values[:2], *melting], gradient, *how, *_held(step, state.x)
+    gradient = [state.extra[GRADIENT]] if heat.affine else []
+    numbers, surface, temperatures = _held(step, state.x)
+    terms, of_terms, power = _terms(heat, state)
+    options = [TRANSFERS.index(heat.transfer), heat.max_iterations, surface]
+    boundaries = [temperatures, of_terms, power] if heat.boundaries.entries else []
+    tensors = [temperature, *values[:2], *melting, *gradient]
+    return tensors, options, [heat.tolerance, heat.reference], numbers, terms, boundaries
 
 
 def heat_changes(heat: Heat, state: State, packed: Tensor, status: Tensor) -> tuple[Tensor, dict[str, Tensor]]:

@@ -9,7 +9,8 @@
 #include "heat/particle.h"
 #include "heat/transfer.h"
 
-// Temperatures that obstacles hold, at the nodes in them and near their surfaces.
+// Boundaries of heat at the nodes: temperatures that obstacles hold, in them and near their surfaces; and the free
+// surface.
 namespace mpm::cpu {
 inline namespace TORCH_MPM_ISA {
 namespace {
@@ -93,6 +94,31 @@ void heat_from_surface(const HeatFromSurfaceArguments<T, D>& a) {
   });
 }
 
+template <class T, int D>
+void heat_terms(const HeatTermsArguments<T, D>& a) {
+  for_blocks(a.topology, [&](int64_t first, int scene, const int*) {
+    for (int64_t i = first; i < first + kBlockNodes<D>; i++) {
+      const T* const sum = a.sums + i * kHeatChannels;
+      T squared = T(0), exchange = T(0), source = sum[kHeatChannels - 1];
+      for (int d = 0; d < D; d++) squared += sum[d] * sum[d];
+      const T area = safe_root(squared);
+      for (int64_t k = 0; k < a.count; k++) {
+        const T* const number = a.number + 2 * (k * a.scenes + scene);
+        const T amount = area * number[0];
+        HeatRadiationAt<T> linear{T(0), amount};  // a flux
+        if (HeatTerm(a.term[k]) == HeatTerm::convection) linear = {amount, amount * number[1]};
+        if (HeatTerm(a.term[k]) == HeatTerm::radiation)
+          linear = heat_radiation(amount, a.theta[i], number[1], T(a.reference));
+        exchange += linear.coefficient;
+        source += linear.power;
+      }
+      a.exchange[i] += exchange;
+      a.source[i] += source;
+    }
+  });
+}
+
+MPM_INSTANTIATE(heat_terms, HeatTermsArguments)
 MPM_INSTANTIATE(heat_hold, HeatHoldArguments)
 MPM_INSTANTIATE(heat_layers, HeatLayersArguments)
 MPM_INSTANTIATE(heat_from_surface, HeatFromSurfaceArguments)
