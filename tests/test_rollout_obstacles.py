@@ -59,9 +59,8 @@ def bodies(dim: int, path, **options) -> list[mpm.boundaries.Obstacle]:
 
 
 @pytest.mark.parametrize("path", PATHS)
-@pytest.mark.parametrize("n", [1, 2, 5, 17])
+@pytest.mark.parametrize(("n", "dtype"), [(1, F64), (2, torch.float32), (5, F64), (17, torch.float32)])
 @pytest.mark.parametrize("transfer", SOME_TRANSFERS)
-@pytest.mark.parametrize("dtype", [torch.float32, F64])
 def test_paths(path, n, transfer, dtype, dim, device):
     state = blob(device, dim, dtype=dtype)
     obstacles = bodies(dim, PATHS[path](dim, device))

@@ -250,8 +250,9 @@ ONE_TIME = {
 }
 
 
-@pytest.mark.parametrize("run", ["rollout", "steps", "to", "torch operations"])
-@pytest.mark.parametrize("scenes", [1, 2, 3])
+@pytest.mark.parametrize(
+    ("run", "scenes"), [("rollout", 2), ("rollout", 3), ("steps", 1), ("steps", 2), ("to", 3), ("torch operations", 2)]
+)
 @pytest.mark.parametrize("path", ONE_TIME)
 def test_paths_of_one_time_serve_scenes_with_times_of_their_own(path, scenes, run, device):
     """Whatever the number of scenes is, also that of the dimensions."""

@@ -11,7 +11,7 @@ for package in ("pydantic", "h5py", "matplotlib", "PIL", "imageio_ffmpeg"):
 
 
 def test_the_mug_moves_in_all_scenes(device, tmp_path, capsys):
-    pictures = example("splat_mug").main(tmp_path, device, count=900, frames=1, resolution=(48, 36))
+    pictures = example("splat_mug").main(tmp_path, device, count=400, frames=1, resolution=(48, 36))
     assert pictures.keys() == {"wobble", "melt", "pour"} and all(len(paths) == 2 for paths in pictures.values())
     for name in pictures:
         first, last = (splats.read(tmp_path / name / "splats" / f"0000{k}.ply") for k in (0, 1))
