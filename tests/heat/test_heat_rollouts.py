@@ -407,3 +407,41 @@ def test_raw_op():
     for message, change in wrong.items():
         with pytest.raises(RuntimeError, match=message):
             torch.ops.torch_mpm.substeps(**arguments | change)
+
+
+@pytest.mark.parametrize("kind", [None, heat_boundaries.Fixed, heat_boundaries.FixedSurface])
+def test_gradients_of_paths_go_step_by_step(kind):
+    ends = []
+    for run in (mpm.rollout, composed):
+        step, state = scene(2)
+        leaf = torch.tensor(0.45, dtype=torch.float64, requires_grad=True)
+        ball = mpm.Sphere(lambda t, leaf=leaf: torch.stack([leaf + 5 * t, 0.25 + 0 * t], -1), 0.12)
+        step.boundaries = [ball]
+        if kind is not None:
+            held(step, (kind, ball, 40.0))
+        ends.append(torch.autograd.grad(run(step, state, 3, DT).temperature.square().sum(), leaf)[0])
+    assert "a gradient is wanted" in plan_rollout(step, state, 3, DT).reasons["fused"]
+    assert float(ends[0].abs()) > 0
+    torch.testing.assert_close(*ends)
+
+
+@pytest.mark.parametrize("transfer", TRANSFERS)
+def test_absent_particles_and_those_outside_keep_their_heat(dim, transfer):
+    """Particles of no scene, and of a scene that moves out of the grid."""
+    step, state = scene(dim, transfer=transfer, melts=True, scenes=2)
+    step.walls = None
+    absent = torch.arange(len(state)) % 3 == 0
+    outside = torch.tensor([500.0, *[0.0] * (dim - 1)], dtype=torch.float64)
+    state = state.replace(
+        scene=state.scene.where(~absent, -1), v=torch.where(state.scene[:, None] == 1, outside, state.v)
+    )
+    end = compare(step, state, 20)
+    with pytest.raises(mpm.SimulationError, match="left the grid"):
+        step.check(end)
+    single = step(state, DT)
+    for before, after in (
+        (state.temperature, single.temperature),
+        *((state.extra[k], single.extra[k]) for k in state.extra),
+    ):
+        assert torch.equal(before[absent], after[absent])
+    assert not torch.equal(state.temperature[~absent], single.temperature[~absent])

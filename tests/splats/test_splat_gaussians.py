@@ -184,3 +184,71 @@ def test_centres_without_an_extent_are_an_error(far, message):
         ValueError, match="extent of the centres of the Gaussians must be positive and finite, " + message
     ):
         splats.placed(made, extent=1.0)
+
+
+def test_the_gradient_of_a_placement_includes_the_extent():
+    made = random_gaussians(4, 1)
+
+    def place(x, axes):
+        placed = splats.placed(made.replace(x=x, axes=axes), up="-z", extent=0.3, center=(0.1, 0.2, 0.3))
+        return placed.x, placed.axes
+
+    assert torch.autograd.gradcheck(place, (made.x.clone().requires_grad_(), made.axes.clone().requires_grad_()))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"quaternion": torch.eye(4)[:3] - torch.eye(4)[:1] * torch.tensor([1.0, 0, 0, 0])},
+            "quaternion must not be zero",
+        ),
+        ({"opacity": torch.tensor([0.5, 1.0, 0.5])}, "opacity must be above 0 and below 1, which Gaussian 1 violates"),
+        ({"opacity": torch.tensor([0.5, 0.5, math.nan])}, "Gaussian 2 violates"),
+        ({"opacity": torch.zeros(2)}, "opacity must have shape"),
+        ({"opacity": None}, "opacity must have shape"),
+        ({"scale": None}, "scale must have shape"),
+        ({"x": None}, "x must have shape"),
+        ({"harmonics": torch.zeros(3, 4, 2)}, "harmonics must have shape"),
+    ],
+)
+def test_wrong_factors_are_named(changes, message):
+    words = {"x": torch.zeros(3, 3), "scale": torch.ones(3, 3), "quaternion": torch.ones(3, 4)}
+    with pytest.raises(ValueError, match=message):
+        splats.Gaussians.from_factors(
+            **{**words, "opacity": torch.full((3,), 0.5), "harmonics": torch.zeros(3, 1, 3), **changes}
+        )
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda g: splats.concatenate([random_gaussians(2), g]),
+        lambda g: splats.deformed(g, torch.zeros(1, 3), torch.zeros(1, 3, 3)),
+        lambda g: splats.moved(g, None),
+        lambda g: splats.particles(g, 0.1),
+        lambda g: splats.placed(g),
+        lambda g: splats.render(g, None),
+        lambda g: splats.visible(g),
+        lambda g: splats.write("none.ply", g),
+    ],
+)
+def test_other_types_are_named(call):
+    with pytest.raises(TypeError, match="must be Gaussians, got int"):
+        call(3)
+
+
+def test_wrong_directions_and_rotations_are_named():
+    made = random_gaussians(3)
+    for call, message in (
+        (
+            lambda: splats.colors(made.harmonics, torch.zeros(2, 3)),
+            r"direction must have shape \[N, 3\] = \[3, 3\], got",
+        ),
+        (lambda: splats.colors(torch.zeros(3, 5, 3), torch.zeros(3, 3)), "harmonics must have shape"),
+        (lambda: splats.basis([0.0, 0.0, 1.0], 1), "direction must have shape"),
+        (lambda: splats.basis(torch.zeros(3), 1.0), "degree must be 0, 1, 2 or 3, got 1.0"),
+        (lambda: splats.rotated(made.harmonics, [1.0]), "rotation must have shape"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            call()

@@ -126,3 +126,21 @@ def test_no_gaussians_are_an_error():
     for call in (lambda: splats.particles(nothing, DX), lambda: splats.placed(nothing)):
         with pytest.raises(ValueError, match="an object needs at least one Gaussian, got none"):
             call()
+
+
+@pytest.mark.parametrize("name", ["x", "axes"])
+def test_numbers_that_are_not_finite_are_an_error(name):
+    made = random_gaussians(3)
+    value = getattr(made, name).clone()
+    value[1] = math.nan
+    with pytest.raises(ValueError, match="the Gaussians must be finite, which Gaussian 1 violates"):
+        splats.particles(made.replace(**{name: value}), DX)
+
+
+def test_centres_that_require_a_gradient_are_an_error():
+    made = random_gaussians(3)
+    leaf = made.replace(x=made.x.clone().requires_grad_())
+    with pytest.raises(ValueError, match="x of the Gaussians must not require grad"):
+        splats.particles(leaf, DX)
+    with torch.no_grad():
+        assert torch.equal(splats.particles(leaf, DX).x, splats.particles(made, DX).x)

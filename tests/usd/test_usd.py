@@ -302,6 +302,15 @@ def test_a_full_disk_is_reported_in_one_line(run, tmp_path):
     assert errors == f"torch-mpm: {tmp_path / 'a.usdc'}: USD cannot write the file: File too large\n"
 
 
+@pytest.mark.parametrize("suffix", stage.SUFFIXES)
+def test_a_file_that_cannot_be_created_is_reported_in_one_line(run, capsys, suffix):
+    if not os.path.isdir("/proc/self"):
+        pytest.skip("there is no /proc, where no file can be created")
+    assert main(["usd", str(run), "-o", f"/proc/a{suffix}", "--quiet"]) == 1
+    expected = f"torch-mpm: /proc/a{suffix}: USD cannot write the file: No such file or directory\n"
+    assert capsys.readouterr().err == expected
+
+
 # ---- wrong inputs
 
 

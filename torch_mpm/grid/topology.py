@@ -136,6 +136,11 @@ class Topology:
         """`scene` clamped to valid ids. Particles of unknown scenes are not transferred, so any id will do."""
         return None if self.scene is None else self.scene.clamp(0, self.scenes - 1)
 
+    def transferred(self) -> Tensor:
+        """Whether each particle is transferred, bool [P]: none of unknown scenes, outside the grid or not finite."""
+        first = torch.arange(self.index.shape[0], device=self.index.device) < self.offsets[-1]
+        return torch.zeros_like(first).scatter(0, self.index.long(), first)
+
     def active_nodes(self) -> Tensor:
         """Whether node rows belong to an active block, bool [N]."""
         return (self.block >= 0).repeat_interleave(self.grid.nodes_per_block)

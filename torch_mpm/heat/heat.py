@@ -217,6 +217,8 @@ class Heat(nn.Module):
     ) -> dict[str, Any]:
         """Fields of the state that a step changes: temperature, and extra where it has fields of this.
 
+        Particles that are absent or outside the grid keep their values.
+
         Args:
             blocks: active blocks of the state's positions.
             state: prepared.
@@ -255,12 +257,14 @@ class Heat(nn.Module):
             nodes.add_source(scatter(blocks, state.x, power[:, None])[:, 0])
         increment = self._solve(nodes, dt)
         theta, gradient = self._to_particles(nodes, increment, smooth, blend, theta, gradient, motion, step)
-        extra = dict(state.extra)
+        inside, extra = blocks.transferred(), dict(state.extra)
         if gradient is not None:
-            extra[GRADIENT] = gradient
+            extra[GRADIENT] = torch.where(inside[:, None], gradient, extra[GRADIENT])
         if self.melts:
-            theta, extra[LIQUID], changing = self._melt(state, specific_heat, theta, extra[LIQUID], number[0].detach())
-            self.fronts.add(changing, state.scene, self.grid.scenes)
+            theta, liquid, changing = self._melt(state, specific_heat, theta, extra[LIQUID], number[0].detach())
+            extra[LIQUID] = torch.where(inside, liquid, extra[LIQUID])
+            self.fronts.add(torch.where(inside, changing, 0), state.scene, self.grid.scenes)
+        theta = torch.where(inside, theta, needed_temperature(state))
         return {"temperature": theta, "extra": extra} if extra else {"temperature": theta}
 
     def _check_parameters(self, particles: int) -> None:

@@ -23,11 +23,12 @@ from ..laws.parameters import PerMaterial, check_length, evaluate, needed_temper
 from ..laws.thermal import LIQUID
 from ..state.state import State
 from ..step.step import Step
-from .facts import differentiates
+from .facts import wants_gradient
+from .steps import Steps
 
 
-def why_not_fused_heat(step: Step, state: State, dt: float | Tensor) -> str | None:
-    """Reason why the fused op does not conduct the heat of a step; None if it does."""
+def why_not_fused_heat(step: Step, state: State, n: int, dt: float | Tensor) -> str | None:
+    """Reason why the fused op does not conduct the heat of n steps; None if it does."""
     heat = step.heat
     assert heat is not None
     if state.x.is_cuda:
@@ -49,8 +50,8 @@ def why_not_fused_heat(step: Step, state: State, dt: float | Tensor) -> str | No
         return "a parameter of its heat is a function"
     if torch.is_grad_enabled():
         parts = [part for v in values for part in (v.values() if isinstance(v, PerMaterial) else (v,))]
-        if any(t.requires_grad for t in (*parts, *_fields(heat, state)) if isinstance(t, Tensor)) or differentiates(
-            step, state, dt
+        if any(t.requires_grad for t in (*parts, *_fields(heat, state)) if isinstance(t, Tensor)) or wants_gradient(
+            Steps(step, n, dt), state
         ):
             return "it conducts heat, and a gradient is wanted"
     return None

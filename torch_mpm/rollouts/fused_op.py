@@ -118,7 +118,7 @@ def substeps_arguments(
     if blocks is not None:
         check_count("blocks", blocks)
     check_state(state)
-    if (reason := why_not_fused(step, state, dt)) is not None:
+    if (reason := why_not_fused(step, state, n, dt)) is not None:
         raise ValueError(f"step must be one that `substeps` supports, got a step that it does not: {reason}")
     arguments, _ = _arguments(step, step.with_residual(step.prepare(state), dt), n, dt, records, blocks)
     return dict(zip(ARGUMENTS, arguments, strict=True))

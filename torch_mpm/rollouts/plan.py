@@ -170,7 +170,7 @@ def plan_of_steps(steps: Steps, state: State) -> RolloutPlan:
     """`plan_rollout` for arguments that were checked."""
     if steps.schedule is not None:
         check_choice("schedule", steps.schedule, SCHEDULES)
-    against_fused = why_not_fused(steps.step, state, steps.dt)
+    against_fused = why_not_fused(steps.step, state, steps.n, steps.dt)
     checkpoints = None if steps.checkpoints is None else _checkpoints_that_fit(steps, state, against_fused is None)
     if against_fused is None:
         return _fused(steps, state, checkpoints)

@@ -37,8 +37,8 @@ from .graph_replay import LEAST_STEPS
 from .steps import Steps
 
 
-def why_not_fused(step: Any, state: State, dt: float | Tensor) -> str | None:
-    """Reason why the fused op does not support the steps; None if it does."""
+def why_not_fused(step: Any, state: State, n: int, dt: float | Tensor) -> str | None:
+    """Reason why the fused op does not support n steps; None if it does."""
     if type(step) is not Step:
         return f"{type(step).__name__} may do more than a Step" if isinstance(step, Step) else "it is no Step"
     x, law, boundaries = state.x, step.law, step.boundaries
@@ -49,7 +49,7 @@ def why_not_fused(step: Any, state: State, dt: float | Tensor) -> str | None:
         return f"dt is a tensor, but not in {str(x.dtype).removeprefix('torch.')}"
     if (reason := _why_not_eager(x)) is not None:
         return reason
-    if step.heat is not None and (reason := why_not_fused_heat(step, state, dt)) is not None:
+    if step.heat is not None and (reason := why_not_fused_heat(step, state, n, dt)) is not None:
         return reason
     if step.integrator is not None:
         return "it is implicit"

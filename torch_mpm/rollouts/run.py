@@ -121,7 +121,7 @@ def _in_parts(steps: Steps, state: State, parts: Parts, plan: RolloutPlan | None
         scales = grid.scenes, grid.dx, steps.dt
     if torch.is_grad_enabled():  # The budget of memory is the same for all parts.
         with_gradient = steps.part(steps.n - parts.first_with_gradient())
-        fused = steps.checkpoints is not None and why_not_fused(step, state, steps.dt) is None
+        fused = steps.checkpoints is not None and why_not_fused(step, state, steps.n, steps.dt) is None
         steps = steps._replace(checkpoints=within_budget(with_gradient, state, fused))
 
     def advance(state: State, count: int, k: int) -> State:

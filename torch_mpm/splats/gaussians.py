@@ -39,13 +39,10 @@ class Gaussians:
 
     def __post_init__(self) -> None:
         x = self.x
-        if not isinstance(x, Tensor) or x.dim() != 2 or x.shape[1] != 3:
-            raise ValueError(f"x must have shape [N, 3], got {shape_of(x)}")
-        if x.dtype not in FLOATING:
-            raise TypeError(f"x must be float32 or float64, got {x.dtype}")
+        check_centres(x)
         N = len(x)
-        check_like("axes", self.axes, x, (N, 3, 3), "[N, 3, 3]")
-        check_like("opacity_logit", self.opacity_logit, x, (N,), "[N]")
+        check_like("axes", self.axes, x, (N, 3, 3), "[N, 3, 3]", needed=True)
+        check_like("opacity_logit", self.opacity_logit, x, (N,), "[N]", needed=True)
         check_harmonics(self.harmonics)
         check_like("harmonics", self.harmonics, x, (N, self.harmonics.shape[1], 3), "[N, K, 3]")
 
@@ -63,10 +60,15 @@ class Gaussians:
             harmonics: [N, K, 3].
 
         Raises:
-            ValueError, TypeError: for another shape, dtype or device.
+            ValueError, TypeError: for another shape, dtype or device, a quaternion of zeros, or an opacity out of
+                range.
         """
-        check_like("scale", scale, x, (len(x), 3), "[N, 3]")
-        check_like("quaternion", quaternion, x, (len(x), 4), "[N, 4]")
+        check_centres(x)
+        check_like("scale", scale, x, (len(x), 3), "[N, 3]", needed=True)
+        check_like("quaternion", quaternion, x, (len(x), 4), "[N, 4]", needed=True)
+        check_like("opacity", opacity, x, (len(x),), "[N]", needed=True)
+        check_rows("quaternion must not be zero", (quaternion == 0).all(1))
+        check_rows("opacity must be above 0 and below 1", ~((opacity > 0) & (opacity < 1)))
         axes = rotation_of(quaternion) * scale[:, None, :]
         return cls(x, axes, opacity.logit(), harmonics)
 
@@ -111,14 +113,37 @@ class Gaussians:
         return Gaussians(*(value.to(device=device, dtype=dtype) for value in values))
 
 
+def check_gaussians(value: object, name: str = "gaussians") -> None:
+    """Raise TypeError for anything but `Gaussians`."""
+    if not isinstance(value, Gaussians):
+        raise TypeError(f"{name} must be Gaussians, got {shape_of(value)}")
+
+
+def check_centres(x: Tensor) -> None:
+    """Raise ValueError or TypeError unless centres are [N, 3] in float32 or float64."""
+    if not isinstance(x, Tensor) or x.dim() != 2 or x.shape[1] != 3:
+        raise ValueError(f"x must have shape [N, 3], got {shape_of(x)}")
+    if x.dtype not in FLOATING:
+        raise TypeError(f"x must be float32 or float64, got {x.dtype}")
+
+
+def check_rows(expected: str, bad: Tensor) -> None:
+    """Raise ValueError that names the first of the Gaussians that are `bad`, bool [N]."""
+    if bool(bad.any()):
+        raise ValueError(f"{expected}, which Gaussian {int(bad.int().argmax())} violates")
+
+
 def concatenate(parts: list[Gaussians]) -> Gaussians:
     """Gaussians of several objects as one; missing harmonics of higher degrees are zero.
 
     Raises:
         ValueError: without parts.
+        TypeError: for a part that is no `Gaussians`.
     """
     if not parts:
         raise ValueError("parts must hold at least one object of Gaussians, got none")
+    for k, part in enumerate(parts):
+        check_gaussians(part, f"parts[{k}]")
     count = max(part.harmonics.shape[1] for part in parts)
     padded = [torch.nn.functional.pad(part.harmonics, (0, 0, 0, count - part.harmonics.shape[1])) for part in parts]
     return Gaussians(

@@ -18,7 +18,8 @@ OFFSET = 0.5
 
 def check_harmonics(harmonics: Tensor) -> None:
     """Raise ValueError unless harmonics have the shape [N, K, 3] with K = 1, 4, 9 or 16."""
-    if not isinstance(harmonics, Tensor) or harmonics.dim() != 3 or harmonics.shape[1] not in COUNTS:
+    fits = isinstance(harmonics, Tensor) and harmonics.dim() == 3
+    if not fits or harmonics.shape[1] not in COUNTS or harmonics.shape[2] != 3:
         raise ValueError(f"harmonics must have shape [N, K, 3] with K = 1, 4, 9 or 16, got {shape_of(harmonics)}")
 
 
@@ -31,9 +32,9 @@ def basis(direction: Tensor, degree: int) -> Tensor:
     Raises:
         ValueError: for another shape, or a degree outside 0 .. 3.
     """
-    if direction.shape[-1:] != (3,):
+    if not isinstance(direction, Tensor) or direction.shape[-1:] != (3,):
         raise ValueError(f"direction must have shape [..., 3], got {shape_of(direction)}")
-    if degree not in range(len(COUNTS)):
+    if type(degree) is not int or degree not in range(len(COUNTS)):
         raise ValueError(f"degree must be 0, 1, 2 or 3, got {degree}")
     parts = [of_degree(direction, k) for k in range(degree + 1)]
     return torch.cat(parts, -1)
@@ -65,7 +66,14 @@ def of_degree(direction: Tensor, degree: int) -> Tensor:
 
 
 def colors(harmonics: Tensor, direction: Tensor) -> Tensor:
-    """Colours [N, 3] (red, green, blue), not negative, of harmonics [N, K, 3] seen along unit directions [N, 3]."""
+    """Colours [N, 3] (red, green, blue), not negative, of harmonics [N, K, 3] seen along unit directions [N, 3].
+
+    Raises:
+        ValueError: for another shape.
+    """
+    check_harmonics(harmonics)
+    if shape_of(direction) != shape_of(harmonics[:, 0]):
+        raise ValueError(f"direction must have shape [N, 3] = {shape_of(harmonics[:, 0])}, got {shape_of(direction)}")
     values = basis(direction, COUNTS.index(harmonics.shape[1]))
     return ((values[:, :, None] * harmonics).sum(1) + OFFSET).clamp(min=0)
 
@@ -85,7 +93,7 @@ def rotated(harmonics: Tensor, rotation: Tensor) -> Tensor:
         ValueError: for another shape.
     """
     check_harmonics(harmonics)
-    if rotation.shape not in ((3, 3), (len(harmonics), 3, 3)):
+    if not isinstance(rotation, Tensor) or rotation.shape not in ((3, 3), (len(harmonics), 3, 3)):
         raise ValueError(f"rotation must have shape [3, 3] or [{len(harmonics)}, 3, 3], got {shape_of(rotation)}")
     turned = rotation.expand(len(harmonics), 3, 3).permute(1, 2, 0).flatten(1)  # [3, 3 N]
     rows = harmonics.permute(1, 2, 0)  # [K, 3, N]; the longest axis is the last one, which is fastest.

@@ -7,8 +7,8 @@ from torch import Tensor
 
 from ..errors import check_count, check_like
 from ..ops.svd import polar
-from ..state.state import State
-from .gaussians import Gaussians
+from ..state.state import State, check_state
+from .gaussians import Gaussians, check_gaussians
 from .harmonics import rotated
 
 
@@ -25,9 +25,10 @@ def deformed(gaussians: Gaussians, x: Tensor, F: Tensor) -> Gaussians:
     Raises:
         ValueError, TypeError: for another shape, dtype or device.
     """
+    check_gaussians(gaussians)
     like, N = gaussians.x, len(gaussians)
-    check_like("x", x, like, (N, 3), "[N, 3]")
-    check_like("F", F, like, (N, 3, 3), "[N, 3, 3]")
+    check_like("new x", x, like, (N, 3), "[N, 3]", needed=True)
+    check_like("F", F, like, (N, 3, 3), "[N, 3, 3]", needed=True)
     harmonics = gaussians.harmonics
     if gaussians.degree > 0:
         harmonics = rotated(harmonics, polar(F).R)
@@ -49,6 +50,8 @@ def moved(gaussians: Gaussians, state: State, first: int = 0) -> Gaussians:
         ValueError, TypeError: for a state of fewer particles or with other ids than 0 to P − 1, or of another dtype or
             device.
     """
+    check_gaussians(gaussians)
+    check_state(state)
     check_count("first", first)
     N, P = len(gaussians), len(state)
     if P < first + N:

@@ -13,7 +13,7 @@ from torch import Tensor
 from ..errors import check_flag, check_number
 from ..geometry import seed as seeding
 from ..geometry.seed import Points, on_host
-from .gaussians import Gaussians
+from .gaussians import Gaussians, check_gaussians, check_rows
 from .interior import Interior, Lattice
 
 FIELD = "gaussian"
@@ -28,6 +28,7 @@ def visible(gaussians: Gaussians, min_opacity: float = FAINT) -> Tensor:
     Raises:
         ValueError: for another minimum.
     """
+    check_gaussians(gaussians)
     check_number("min_opacity", min_opacity, "within 0 and 1", lambda v: 0 <= v <= 1)
     return (gaussians.opacity >= min_opacity).nonzero()[:, 0]
 
@@ -62,8 +63,10 @@ def particles(
         Points, with the number of their Gaussian in `fields["gaussian"]`, int64 [P], or −1.
 
     Raises:
-        ValueError, TypeError: for wrong arguments, no Gaussians, or more particles or cells than fit in memory.
+        ValueError, TypeError: for wrong arguments, no Gaussians, centres that require grad, numbers that are
+            not finite, or more particles or cells than fit in memory.
     """
+    check_gaussians(gaussians)
     check_flag("fill", fill)
     if len(gaussians) == 0:
         raise ValueError("an object needs at least one Gaussian, got none")
@@ -71,6 +74,9 @@ def particles(
         raise ValueError(f"grid must have 3 dimensions for Gaussians, got {dim}")
     dx = check_number("the grid's dx", getattr(grid, "dx", grid), "positive", lambda v: 0 < v < math.inf)
     per_cell = check_number("per_cell", per_cell, "positive", lambda v: 0 < v < math.inf)
+    if torch.is_grad_enabled() and gaussians.x.requires_grad:
+        raise ValueError("x of the Gaussians must not require grad, which particles do not have: detach it")
+    check_rows("the Gaussians must be finite", ~(gaussians.x.isfinite().all(1) & gaussians.axes.isfinite().all((1, 2))))
     with on_host(), torch.no_grad():
         host = gaussians.to("cpu")
         lattice = Lattice(host.x, float(dx / per_cell ** (1 / 3)))

@@ -9,10 +9,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..errors import check_vector
+from ..errors import check_vector, shape_of
 from ..render.camera import Camera
 from . import gsplat_renderer, rasteriser
-from .gaussians import Gaussians
+from .gaussians import Gaussians, check_gaussians
 
 BACKENDS = ("auto", "software", "gsplat")
 
@@ -40,11 +40,14 @@ def render(
             "auto": gsplat where it is installed and can draw these Gaussians.
 
     Raises:
-        ValueError, TypeError: for another backend or background.
+        ValueError, TypeError: for another backend or background, or anything but Gaussians and a camera.
         ImportError: where backend is "gsplat" and the package is missing.
     """
     if backend not in BACKENDS:
         raise ValueError(f"backend must be one of {', '.join(BACKENDS)}, got {backend!r}")
+    check_gaussians(gaussians)
+    if not isinstance(camera, Camera):
+        raise TypeError(f"camera must be a Camera, got {shape_of(camera)}")
     width, height = camera.resolution
     given = background if isinstance(background, Tensor) else check_vector("background", background, 3)
     behind = torch.as_tensor(given)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..boundaries.motion import rotation_matrix
 from ..errors import check_number, check_vector
-from .gaussians import Gaussians
+from .gaussians import Gaussians, check_gaussians
 from .harmonics import rotated
 
 AXES = ("+x", "-x", "+y", "-y", "+z", "-z")
@@ -25,7 +25,8 @@ def placed(
     *,
     world_up: str = "+y",
 ) -> Gaussians:
-    """Turned, scaled and moved Gaussians. Exact: covariances and harmonics turn and scale with the centres.
+    """Turned, scaled and moved Gaussians. Exact: covariances and harmonics turn and scale with the centres. Gradients
+    pass to the Gaussians.
 
     Args:
         gaussians: the object in the coordinates of its file.
@@ -37,18 +38,17 @@ def placed(
     Raises:
         ValueError, TypeError: for another axis, extent or center, or no Gaussians.
     """
+    check_gaussians(gaussians)
     x = gaussians.x
     if len(x) == 0:
         raise ValueError("an object needs at least one Gaussian, got none")
     rotation = turn(up, world_up).to(x)
     x, axes = x @ rotation.T, rotation @ gaussians.axes
     if extent is not None:
-        longest = float((x.amax(0) - x.amin(0)).max())
-        if not 0 < longest < math.inf:
-            raise ValueError(
-                f"the extent of the centres of the Gaussians must be positive and finite, got {longest:g} m"
-            )
-        factor = check_number("extent", extent, "positive", lambda v: 0 < v < math.inf) / longest
+        longest = (x.amax(0) - x.amin(0)).max().double()
+        if not 0 < (found := float(longest.detach())) < math.inf:
+            raise ValueError(f"the extent of the centres of the Gaussians must be positive and finite, got {found:g} m")
+        factor = (check_number("extent", extent, "positive", lambda v: 0 < v < math.inf) / longest).to(x)
         x, axes = factor * x, factor * axes
     if center is not None:
         middle = x.new_tensor(check_vector("center", center, 3))

@@ -13,7 +13,7 @@ from torch import Tensor
 from ..data.whole_files import replacing
 from ..geometry import point_files
 from ..geometry.surface_mesh import Array
-from .gaussians import Gaussians
+from .gaussians import Gaussians, check_gaussians
 from .harmonics import COUNTS
 
 COLOR = tuple(f"f_dc_{k}" for k in range(3))
@@ -104,6 +104,7 @@ def write(path: str | os.PathLike[str], gaussians: Gaussians) -> int:
         OSError: when it cannot be written; nothing remains of it.
         ValueError: for Gaussians that are not finite.
     """
+    check_gaussians(gaussians)
     table = table_of(gaussians)
     if not bool(np.isfinite(table).all()):
         row = int(np.argmin(np.isfinite(table).all(1)))

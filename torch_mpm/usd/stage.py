@@ -18,7 +18,7 @@ from ..data.whole_files import replacing
 SUFFIXES = (".usdc", ".usda", ".usd")
 SAVED_BYTES = 2**26
 """Size of the frames that are kept in memory [bytes]. Each move to the disk repeats the index of the file."""
-MESSAGE = re.compile(r"'(?:Error occurred writing file: )?([^'\n]{1,200})'\s*$", re.MULTILINE)
+MESSAGE = re.compile(r"'(?:Error occurred writing file: |: )?([^'\n]{1,200})'\s*$", re.MULTILINE)
 """Message in a line of an error of USD."""
 PURPOSE, EXTRA = "USD files", "usd"
 
@@ -48,8 +48,14 @@ class Stage:
             last: number of the last frame.
             up: upward axis, "Y" or "Z".
             title: documentation of the file.
+
+        Raises:
+            OSError: when USD cannot create it.
         """
-        self.stage = pxr("Usd").Stage.CreateNew(str(path))
+        try:
+            self.stage = pxr("Usd").Stage.CreateNew(str(path))
+        except pxr("Tf").ErrorException as failure:
+            raise OSError(errno.EIO, _reason(failure), str(path)) from failure
         self.stage.SetStartTimeCode(0)
         self.stage.SetEndTimeCode(last)
         self.stage.SetTimeCodesPerSecond(rate)
