@@ -116,7 +116,8 @@ def test_z_that_is_the_same_everywhere_is_left_out_in_two_dimensions(tmp_path):
         ("1,2,3\n4,5,6,7\n", None, "columns"),
         ("1,2,3\n4,five,6\n", None, "five"),
         ("x,y,z\n0,5,0,3,1,2\n", None, r"names 3 columns .* has 6 numbers in a row"),
-        ("0,5;1,5;2,5\n", None, "its first line must be numbers or name the columns"),
+        ("0,5\t1,5\t2,5\n", None, "its first line must be numbers or name the columns"),
+        ("1.000,5;1,5;2,5\n", None, "its first line must be numbers or name the columns"),
         ("a,b,c\n1,2,3\n", None, r"its first line must be numbers or name the columns .* got \['a', 'b', 'c'\]"),
         ("x,y,x\n1,2,3\n", None, "has two columns"),
         ("x,y,volume,vol\n1,2,3,4\n", None, "has two columns"),
@@ -181,6 +182,45 @@ def test_names_in_a_comment_in_any_order(names, mark, tmp_path):
     np.testing.assert_array_equal(found.x, [[10 * r + k for k in axes] for r in (1, 2)])
     assert (found.volume is None) == ("volume" not in columns)
     assert found.volume is None or found.volume.tolist() == [10.0, 20.0]
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        "# z [m] y [m] x [m]",
+        "# z (m)   y (m)   x (m)",
+        "# z/m, y/m, x/m",
+        "z [m] y [m] x [m]",
+        "% z_m y_m x_m",
+        "z_m,y_m,x_m",
+    ]
+    + ["# Columns = z, y, x", "# fields: z, y, x", "#columns:z,y,x", "# names : z y x"],
+)
+@pytest.mark.parametrize("separator", [" ", ","])
+def test_names_with_units_and_headings(names, separator, tmp_path):
+    path = tmp_path / "points.txt"
+    path.write_text(names + "\n" + separator.join("012") + "\n")
+    assert point_files.read(path).x.tolist() == [[2.0, 1.0, 0.0]]
+
+
+@pytest.mark.parametrize("form", ["{} [mm]", "{} (mm)", "{}_mm", "{}/mm", "{} / cm", "{}_cm"])
+@pytest.mark.parametrize("mark", ["# ", "% ", ""])
+@pytest.mark.parametrize("separator", [" ", ", "])
+def test_units_other_than_metres_are_refused(form, mark, separator, tmp_path):
+    if " / " in form and separator == " ":
+        form = form.replace(" ", "")
+    path = tmp_path / "points.txt"
+    path.write_text(mark + separator.join(form.format(axis) for axis in "xyz") + "\n" + separator.join("012") + "\n")
+    with pytest.raises(ValueError, match=r"the column 'x.*' must be in m"):
+        point_files.read(path)
+
+
+@pytest.mark.parametrize("head", ["x;y;z\n", "x [m];y [m];z [m];\n", ""])
+@pytest.mark.parametrize("row", ["0,5;-1,25;2,5e1", "0,5; -1,25; 25", "0.5;-1.25;25", '"0,5";"-1,25";"25,0"'])
+def test_decimal_commas_between_semicolons(head, row, tmp_path):
+    path = tmp_path / "points.csv"
+    path.write_text(f"{head}{row}\n{row};\n")
+    assert point_files.read(path).x.tolist() == [[0.5, -1.25, 25.0]] * 2
 
 
 @pytest.mark.parametrize("rows", [3, 4])

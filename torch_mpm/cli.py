@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import io
 import json
 import signal
 import sys
@@ -36,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     came: list[type[KeyboardInterrupt]] = []
     try:
-        with signals_raise(came), warnings_in_lines():
+        with signals_raise(came), warnings_in_lines(), any_text_on_stdout():
             options = _parser().parse_args(arguments)
             host_memory.require_address_space(LEAST, "a command with the packages that it imports")
             options.command(options)
@@ -113,6 +114,20 @@ def warnings_in_lines() -> Iterator[None]:
         warnings.formatwarning = usual
 
 
+@contextlib.contextmanager
+def any_text_on_stdout() -> Iterator[None]:
+    """Letters that the encoding of stdout lacks, as in the locale C, are printed as escapes, as stderr does."""
+    stdout = sys.stdout
+    if not isinstance(stdout, io.TextIOWrapper) or stdout.errors != "strict":
+        yield
+        return
+    stdout.reconfigure(errors="backslashreplace")
+    try:
+        yield
+    finally:
+        stdout.reconfigure(errors="strict")
+
+
 REPORTED = (
     "SceneError", "OutputError", "DamagedFileError", "SimulationError", "Interrupted", "RenderError", "WorkerError",
     "IncompleteError", "VerifyError", "DatasetError", "MissingError", "FailedScenesError", "SurfaceError", "UsdError",
@@ -134,6 +149,8 @@ def _message(error: Exception) -> str | None:
         return f"out of memory: {host_memory.shortage(error)}; {remedy}"
     if isinstance(error, OSError) and error.strerror and error.filename is not None:
         return f"{error.filename}: {error.strerror}"
+    if isinstance(error, UnicodeEncodeError):
+        return f"the locale cannot encode {error.object!r}; set LC_ALL=C.UTF-8"
     names = {kind.__name__ for kind in type(error).__mro__}
     return str(error) if names.intersection(REPORTED) or isinstance(error, (OSError, ImportError)) else None
 

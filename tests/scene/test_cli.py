@@ -1,5 +1,6 @@
 """The command line, as a user calls it."""
 
+import io
 import json
 import shutil
 import signal
@@ -36,6 +37,17 @@ def test_run_prints_where_things_are_and_what_it_took(scene, tmp_path, capsys):
         assert read.attributes["scene"] == scene.read_text()
     summary = json.loads((tmp_path / "out" / "run.json").read_text())["summary"]
     assert summary["frames"] == 2 and summary["particles_lost"] == 0
+
+
+@pytest.mark.parametrize(
+    ("encoding", "shown"), [("ascii", r"Gr\xf6\xdfe \u6f22"), ("latin-1", r"Größe \u6f22"), ("utf-8", "Größe 漢")]
+)
+def test_letters_that_the_encoding_of_stdout_lacks(scene, monkeypatch, encoding, shown):
+    stdout = io.TextIOWrapper(io.BytesIO(), encoding=encoding)
+    monkeypatch.setattr(sys, "stdout", stdout)
+    assert main(["info", str(scene), "--set", "title=Größe 漢"]) == 0
+    stdout.flush()
+    assert f"title  {shown}\n" in stdout.buffer.getvalue().decode(encoding) and stdout.errors == "strict"
 
 
 def test_outputs_that_the_scene_names(scene, tmp_path, capsys):

@@ -20,6 +20,7 @@ pytest.importorskip("h5py")
 import h5py
 
 from torch_mpm import SimulationError, State, Trajectory
+from torch_mpm.data.export import export_ply, export_vtk
 from torch_mpm.scene import Scene, SceneError, folder, heap, writer
 from torch_mpm.scene import run as module
 from torch_mpm.scene.diagnose import SceneFailure, replay
@@ -229,6 +230,34 @@ def test_a_stop_signal_ends_after_a_whole_frame_and_resumes_bit_for_bit(tmp_path
             np.testing.assert_array_equal(read[name], whole[name])
     assert summary["substeps"] == whole["substeps"].sum()
     assert not list((tmp_path / "out").glob("*.building")) and not (tmp_path / "out" / "checkpoint.h5").exists()
+
+
+@pytest.mark.parametrize("changes", [{"transfer": "flip"}, {"transfer": "pic"}, {"transfer": "flip", "emitter": [JET]}])
+def test_runs_of_bodies_that_spin_resume_without_apic(changes, tmp_path):
+    words = {"body__0__spin": 3.0, **changes}
+    _, whole, _ = simulate(tmp_path / "whole", **words)
+
+    def stop(figures):
+        if figures["frame"] == 2:
+            raise ZeroDivisionError
+
+    scene = Scene(**disc(device="cpu", **words))
+    with pytest.raises(ZeroDivisionError):
+        scene.run(tmp_path / "out", progress=stop)
+    scene.run(tmp_path / "out", resume=True)
+    with Trajectory(tmp_path / "out") as read:
+        for name in whole:
+            np.testing.assert_array_equal(read[name], whole[name])
+
+
+def test_exports_of_frames_without_particles(tmp_path):
+    meshio = pytest.importorskip("meshio")
+    _, data, _ = simulate(tmp_path / "out", body=[], emitter=[{**JET, "start": 0.03}])
+    assert data["particles"][0] == 0 < data["particles"][-1]
+    ply, vtk = export_ply(tmp_path / "out"), export_vtk(tmp_path / "out").parent
+    assert [len(meshio.read(file).points) for file in sorted(ply.iterdir())] == list(data["particles"])
+    for file, count in zip(sorted(vtk.glob("*.vtu")), data["particles"], strict=True):
+        assert f'NumberOfPoints="{count}"' in file.read_text()
 
 
 def test_a_stop_signal_ends_a_frame_that_takes_long(tmp_path):

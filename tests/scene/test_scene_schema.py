@@ -148,6 +148,23 @@ def test_overrides(tmp_path):
             Scene.load(path, [override])
 
 
+@pytest.mark.parametrize("name", ["weicher Ton", "sand.grob", "a[0]", "Gelée 漢", "a=b"])
+@pytest.mark.parametrize("quote", ['"', "'"])
+def test_overrides_of_names_in_quotes(name, quote, tmp_path):
+    path = tmp_path / "scene.toml"
+    path.write_text(
+        FILE.format(duration=1).replace("material.jelly", f"material.'{name}'").replace('"jelly"', f"'{name}'")
+    )
+    assert Scene.load(path, [f"material.{quote}{name}{quote}.E=3e4"]).material[name].E == 3e4
+
+
+@pytest.mark.parametrize("override", ["grid.dx=0.1\nkernel='cubic'", "duration=1\nfps=5", "title='a'\n[grid]\ndx=1"])
+def test_an_override_of_several_keys(override, tmp_path):
+    (tmp_path / "scene.toml").write_text(FILE.format(duration=1))
+    with pytest.raises(SceneError, match=r"must have one value, got more keys: (kernel|fps|grid)"):
+        Scene.load(tmp_path / "scene.toml", [override])
+
+
 def test_python_says_what_the_file_says(tmp_path):
     (tmp_path / "scene.toml").write_text(FILE.format(duration=0.1))
     loaded = Scene.load(tmp_path / "scene.toml")

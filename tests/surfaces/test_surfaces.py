@@ -1,6 +1,7 @@
 """Surfaces of particles: volume, velocity and normals against exact values, their files, and wrong inputs."""
 
 import json
+import re
 import shutil
 import sys
 
@@ -20,6 +21,7 @@ from torch_mpm.cli import main  # noqa: E402
 from torch_mpm.scene import pictures  # noqa: E402
 from torch_mpm.scene import surfaces as run_surfaces  # noqa: E402
 from torch_mpm.scene.folder import load_run  # noqa: E402
+from torch_mpm.scene.groups import different_names  # noqa: E402
 from torch_mpm.surfaces import files  # noqa: E402
 
 SAND = """
@@ -406,3 +408,18 @@ def test_a_data_set_is_refused(tmp_path, capsys):
     folder = small_dataset.make_dataset(tmp_path / "set")
     assert main(["surface", str(folder)]) == 1
     assert "surface is for runs, and this is a data set" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "labels",
+    [
+        ["water", "Water", "water 1"],
+        ["a/b", "a:b", "a_b_1"],
+        ["a", "a", "a 0", "a 1"],
+        ["", "*", "unnamed 1"],
+        ["a", "b"],
+    ],
+)
+def test_file_names_of_groups_differ(labels):
+    names = different_names(labels)
+    assert len(set(names)) == len(labels) and all(re.fullmatch(r"\w+", name) for name in names)

@@ -168,7 +168,7 @@ class Configuration:
         except SceneError as error:
             raise SceneError(error.problems, source) from None
         if text:
-            text = "".join(f"# --set {item}\n" for item in overrides or []) + text
+            text = "".join("# --set " + item.replace("\n", "\n# ") + "\n" for item in overrides or []) + text
         else:
             text = json.dumps(words, indent=1)
         return cls(words, dataset, text, folder, source, digest)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -137,7 +138,7 @@ def _three_dimensional(value: Array, last: Array | float = 0.0) -> Array:
     whole = np.pad(value, padding)
     if value.shape[1:] == (2, 2):
         whole[:, 2, 2] = last
-    return whole.reshape(len(value), *([-1] if value.ndim > 1 else []))
+    return whole.reshape(len(value), *([math.prod(whole.shape[1:])] if value.ndim > 1 else []))  # -1 needs particles.
 
 
 def _stress(name: str, measure: str, fields: Mapping[str, Array]) -> Array:

@@ -48,9 +48,10 @@ def read(path: str | Path, dim: int | None = None) -> PointFile:
     - .npy: positions [P, D].
     - .npz: positions ``x`` [P, D] and perhaps volumes ``volume`` [P].
     - .csv, .tsv, .txt: rows of numbers separated by commas, semicolons, tabs or spaces; lines that begin with #, % or
-      // are comments. Names of the columns may stand in a first line, a comment or not: x, y, (z,) (volume) in any case
-      and order, among others; also Points:0, position_x and the like, with the unit [m]. Without names the columns are
-      the positions, then perhaps the volume: three columns are x, y, z, but x, y, volume with ``dim`` 2.
+      // are comments. Numbers between semicolons may have a decimal comma. Names of the columns may stand in a first
+      line, a comment or not: x, y, (z,) (volume) in any case and order, among others; also Points:0, position_x and the
+      like, with the unit m: x [m], x (m), x/m or x_m. Without names the columns are the positions, then perhaps the
+      volume: three columns are x, y, z, but x, y, volume with ``dim`` 2.
     - .ply: the properties x, y, z and perhaps volume of its vertices, ASCII or binary.
 
     Args:
@@ -150,6 +151,7 @@ def _rows(lines: Sequence[str], first: int, separator: str | None) -> Iterator[s
         text = line.partition("#")[0].strip()
         if not text or text.startswith(COMMENTS):
             continue
+        text = _with_points(text, separator)
         quick = separator is not None and '"' not in text and not text.endswith(separator)
         count = text.count(separator) + 1 if separator and quick else len(_cells(text, separator))
         if count != expected:
@@ -164,17 +166,25 @@ def _header(lines: Sequence[str]) -> tuple[list[str], int]:
     for index, line in enumerate(lines):
         text = line.strip()
         comment = text.startswith(COMMENTS)
-        text = text.lstrip("#%/ ") if comment else text
-        cells = _cells(text, _separator(text))
+        cells, titles = _cells(text, _separator(text)), _titles(text.lstrip("#%/ ") if comment else text)
         if comment:
-            remarks.append(cells[1:] if cells and cells[0].endswith(":") else cells)
-        elif _coordinates(cells) and not names:
-            names = cells
+            remarks.append(titles)
+        elif _coordinates(titles) and not names:
+            names = titles
         elif cells:
             names = names or _names_in(remarks, len(cells))
             _check_first(names, cells)
             return names, index
     return names, len(lines)
+
+
+def _titles(text: str) -> list[str]:
+    """Cells of a line that may name columns, with their units, without a heading such as "Columns:"."""
+    heading = re.match(r"([^\W\d][\w ]*?)\s*[:=]\s*", text)
+    if heading and not any(re.fullmatch(family, heading[1].lower().split()[-1]) for family in FAMILIES):
+        text = text[heading.end() :]
+    separator = _separator(text)
+    return _cells(text if separator else re.sub(r"\s+(?=[\[(][^\W\d][^\s\])]*[\])])", "", text), separator)
 
 
 def _names_in(remarks: Sequence[Sequence[str]], count: int) -> list[str]:
@@ -206,8 +216,13 @@ def _separator(line: str) -> str | None:
 def _cells(line: str, separator: str | None) -> list[str]:
     text = line.partition("#")[0].strip()
     cells = next(csv.reader([text], delimiter=separator, skipinitialspace=True), []) if separator else text.split()
-    cells = [cell.strip().strip("\"'") for cell in cells]
+    cells = [_with_points(cell.strip().strip("\"'"), separator) for cell in cells]
     return cells[:-1] if separator and cells and not cells[-1] else cells  # Lines may end with a separator.
+
+
+def _with_points(text: str, separator: str | None) -> str:
+    """Text with decimal points in place of decimal commas, which numbers between semicolons may have."""
+    return re.sub(r"(?<=\d),(?=\d)", ".", text) if separator == ";" and "," in text else text
 
 
 def _is_number(cell: str) -> bool:
@@ -219,9 +234,9 @@ def _is_number(cell: str) -> bool:
 
 
 def _words_and_unit(name: str) -> tuple[str, str]:
-    """A name such as "Position_X [m]" in lower case, and its unit."""
-    found = re.fullmatch(r"(.*?)\s*[\[(]([^\W\d][^\])]*)[\])]", name.lower())
-    return (found[1], found[2].strip()) if found else (name.lower(), "")
+    """A name such as "Position_X [m]", "x/m" or "x_m" in lower case, and its unit."""
+    found = re.fullmatch(r"(.*?)(?:\s*[\[(]([^\W\d][^\])]*)[\])]|\s*/\s*([^\W\d]\w*)|_([cdkmnu]?m[23]?))", name.lower())
+    return (found[1], (found[2] or found[3] or found[4]).strip()) if found else (name.lower(), "")
 
 
 def _coordinates(names: Sequence[str]) -> list[list[int]]:

@@ -131,7 +131,7 @@ class Environments:
         groups = [state.select(rows) for rows in torch.arange(len(state), device=state.x.device).split(B)]
         state = State.concatenate([self.step.prepare(self._placed(group)) for group in groups])
         made = {name: value.nan_to_num(nan=0.0) for name, value in state.extra.items()}  # Absent particles.
-        keeps_C = self.step.transfer == "apic" or self.step.law.viscous
+        keeps_C = self.step._keeps_C
         C = state.C if keeps_C else None
         if keeps_C and C is None:
             C = torch.zeros_like(state.x[:, :, None].expand(-1, -1, state.x.shape[1]))

@@ -180,7 +180,7 @@ def _substeps(
     if step.heat is not None:
         temperature, of_heat = heat_changes(step.heat, state, heat, heat_status)
         extra |= of_heat
-        C = C if step.transfer == "apic" or step.law.viscous else None
+        C = C if step._keeps_C else None
     now = time_after(state.time, dt, n) if time is None else _in_shape(time.detach(), state.time, dt)
     if requires_grad(dt) or requires_grad(state.time):
         known: Any = state.time + n * (dt.double() if isinstance(dt, Tensor) else dt)

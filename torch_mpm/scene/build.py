@@ -162,7 +162,8 @@ def build(scene: Any, device: torch.device) -> Built:
         else _named("heat", heat.conduction, scene, entries, grid, mixture.words(), solids, device),
     )
     ids = torch.arange(len(first), device=device)
-    state = step.prepare(first.replace(ids=ids))
+    C = first.C if step._keeps_C else None  # Of bodies that spin; checkpoints do not have it either.
+    state = step.prepare(first.replace(ids=ids, C=C))
     moved = None
     if scene.project:
         state, moved = step.project(state)

@@ -70,4 +70,6 @@ def _rows(arrays: dict[str, Array], scene: int, material: int) -> Array:
 def different_names(labels: Sequence[str]) -> list[str]:
     """Names for files, with a number where they would be equal."""
     names = [file_name(label) or "unnamed" for label in labels]
-    return [f"{name}_{k}" if names.count(name) > 1 else name for k, name in enumerate(names)]
+    while len(set(names)) < len(names):
+        names = [f"{name}_{k}" if names.count(name) > 1 else name for k, name in enumerate(names)]
+    return names

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import sys
 from pathlib import Path
 from typing import Any, get_args
@@ -228,20 +229,37 @@ def parsed(path: Path) -> tuple[str, dict[str, Any]]:
         raise SceneError([f"not a TOML file: {error}"], str(path)) from None
 
 
+def _steps(key: str) -> list[str]:
+    """Names and indices of the key of an override. A name in quotes may have dots and brackets, as in TOML."""
+    quoted: list[str] = []
+
+    def keep(found: re.Match[str]) -> str:
+        quoted.append(found[0][1:-1])
+        return f"\0{len(quoted) - 1}\0"
+
+    plain = re.sub(r"""(?<![^.])(?:"[^"]*"|'[^']*')(?![^.\[])""", keep, key)
+    steps = [step for part in plain.split(".") for step in part.replace("]", "").split("[")]
+    return [re.sub(r"\0(\d+)\0", lambda found: quoted[int(found[1])], step) for step in steps]
+
+
 def override(words: dict[str, Any], text: str) -> None:
     """Set a value of nested dictionaries by ``key=value``, as for `Scene.load`.
 
     Raises:
         SceneError: for another text, or an unknown key.
     """
-    key, equals, value = text.partition("=")
-    steps = [s for part in key.strip().split(".") for s in part.replace("]", "").split("[")]
-    if not equals or not all(steps):
+    found = re.fullmatch(r"""((?:"[^"]*"|'[^']*'|[^"'=])*)=(.*)""", text, re.DOTALL)
+    key, value = found.groups() if found else ("", "")
+    steps = _steps(key.strip())
+    if not all(steps):
         raise SceneError([f"override {text!r} must look like grid.dx=0.01"])
     try:
-        given = tomllib.loads(f"value = {value}")["value"]
+        parsed_value = tomllib.loads(f"value = {value}")
     except (ValueError, RecursionError):
-        given = value.strip()
+        parsed_value = {"value": value.strip()}
+    if len(parsed_value) > 1:
+        raise SceneError([f"override {text!r} must have one value, got more keys: {', '.join([*parsed_value][1:])}"])
+    given = parsed_value["value"]
     target: Any = words
     try:
         for step in steps[:-1]:

@@ -231,11 +231,10 @@ class Step(TensorModule):
         if self.on_grid is not None:
             velocity = from_half(self.on_grid(blocks, velocity, nodes[:, 0], dt), nodes)
         deformed = {name: fields.get(name, getattr(state, name)) for name in ("F", "J")}
-        keeps_C = self.transfer == "apic" or law.viscous
         x, v, C, F, J, residual = g2p_advance_compensated(
             *(blocks, state.x, state.x_residual, velocity, dt),
             **deformed,
-            affine=keeps_C or self.heat is not None,
+            affine=self._keeps_C or self.heat is not None,
             stress_form=form,
         )
         if self._flip_share:  # positions move with the grid velocity, so that FLIP's noise does not reach them
@@ -247,7 +246,12 @@ class Step(TensorModule):
             motion = C if form == "mls" else g2p(blocks, state.x, velocity, affine=False, gradient=True)[2]
             with full_precision(state.x):
                 changes |= self.heat.update(blocks, state, dt, motion, dissipated)
-        return state.replace(x=x, v=v, C=C if keeps_C else None, time=time_after(state.time, dt), **changes)
+        return state.replace(x=x, v=v, C=C if self._keeps_C else None, time=time_after(state.time, dt), **changes)
+
+    @property
+    def _keeps_C(self) -> bool:
+        """Whether states after a step have the affine velocity C."""
+        return self.transfer == "apic" or bool(self.law.viscous)
 
     def prepare(self, state: State) -> State:
         """A state with all fields that this step needs."""
