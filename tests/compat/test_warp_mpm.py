@@ -294,7 +294,7 @@ def test_what_cannot_be_done_is_said(call, error, message):
 
 def test_a_material_without_its_parameters():
     solver, model, state = made({"material": "metal"})
-    with pytest.raises(ValueError, match="yield_stress of 'metal' must be positive, got 0 for particle 0$"):
+    with pytest.raises(ValueError, match=r"yield_stress of 'metal' must be positive, got 0 for particle 0$"):
         solver.rollout(model, state, state, 1, DT)
     solver, model, state = made()
     model.mu = torch.zeros_like(model.mu)
