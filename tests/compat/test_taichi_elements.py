@@ -247,6 +247,32 @@ def test_a_restart_continues():
         (lambda: MPMSolver((8, 8)).add_surface_collider((0, 0), (0, 1), 5), ValueError, "surface must be one of"),
         (lambda: MPMSolver((8, 8)).add_mesh(None, 1), NotImplementedError, "voxelizer"),
         (lambda: MPMSolver((8,) * 3).add_ngon(5, (0, 0), 1, 0, 1), ValueError, "add_ngon needs a solver of 2"),
+        (
+            lambda: MPMSolver((8, 8)).add_cube((0, 0), (-1, 1), 1),
+            ValueError,
+            "cube_size must not be negative",
+        ),
+        (
+            lambda: MPMSolver((8, 8)).add_cube((0, 0), (1, 1), 1, sample_density=-1),
+            ValueError,
+            "sample_density must be",
+        ),
+        (lambda: MPMSolver((8, 8)).add_cube((0, 0), (1, 1), "water"), TypeError, "material must be a whole number"),
+        (lambda: MPMSolver((8, 8)).add_ellipsoid((0, 0), -1.0, 1), ValueError, "radius must be positive"),
+        (lambda: MPMSolver((8, 8)).add_ngon(5, (0, 0), -1.0, 0.0, 1), ValueError, "radius must be positive"),
+        (lambda: MPMSolver((8, 8), dt_scale=0), ValueError, "dt_scale must be positive"),
+        (lambda: MPMSolver((8, 8), E_scale=-1), ValueError, "E_scale must be positive"),
+        (lambda: MPMSolver((8, 8)).add_particles([[0.5, 0.5], [0.5, np.nan]], 1), ValueError, "finite, .* particle 1$"),
+        (
+            lambda: MPMSolver((8, 8)).read_restart(2, np.zeros((2, 2)), np.zeros((1, 2)), [1, 1], [0, 0]),
+            ValueError,
+            "velocities must have shape",
+        ),
+        (
+            lambda: MPMSolver((8, 8)).set_gravity(torch.zeros(2, requires_grad=True)),
+            ValueError,
+            "g must be 2 numbers, got a tensor that requires grad",
+        ),
         (lambda: MPMSolver((8, 8)).step(0.0), ValueError, "frame_dt must be positive"),
     ],
 )
@@ -258,3 +284,14 @@ def test_what_cannot_be_done_is_said(call, error, message):
 def test_options_of_the_storage_are_reported():
     with pytest.warns(UserWarning, match="have no effect: quant, use_g2p2g"):
         MPMSolver((8, 8), quant=True, use_g2p2g=True)
+
+
+def test_no_particles_are_added_and_tensors_are_vectors():
+    solver = MPMSolver((8, 8))
+    solver.add_particles(np.zeros((0, 2)), MPMSolver.material_water)
+    solver.step(1e-3)
+    solver.set_gravity(torch.tensor([0.0, -1.0]))
+    solver.add_cube((0.4, 0.4), (0.2, 0.2), MPMSolver.material_elastic, velocity=torch.tensor([0.5, 0.0]))
+    solver.step(1e-3)
+    velocity = solver.particle_info()["velocity"]
+    assert len(velocity) and velocity[:, 0].min() > 0.1 and velocity[:, 1].max() < 0

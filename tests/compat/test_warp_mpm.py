@@ -273,6 +273,11 @@ def test_densities_of_a_mask(device):
         (lambda s, m, p: s.set_parameters_dict(m, p, {"E": 1.0}), ValueError, "'E' is not supported: call set_E_nu"),
         (lambda s, m, p: s.set_parameters_dict(m, p, {"denstiy": 1.0}), ValueError, "nearest known key is 'density'"),
         (lambda s, m, p: s.set_parameters_dict(m, p, {"material": "water"}), TypeError, "material must be one of"),
+        (lambda s, m, p: s.set_parameters_dict(m, p, {"kappa": 1.0}), ValueError, "law of MPMAvatar's cloth does not"),
+        (lambda s, m, p: s.set_E_nu(m, -m.E, m.nu), ValueError, r"E must be .*, got -\S+ for particle 0$"),
+        (lambda s, m, p: s.rollout(m, p, None, 1, DT), TypeError, "next_state must be an MPMStateStruct, got NoneType"),
+        (lambda s, m, p: s.p2g2p(p, p, 0, DT), TypeError, "mpm_model must be an MPMModelStruct, got MPMStateStruct"),
+        (lambda s, m, p: p.from_torch(torch.ones(64, 3).long(), p.particle_vol), TypeError, "tensor_x must be float32"),
         (lambda s, m, p: m.mass, AttributeError, "MPMModelStruct has no 'mass'"),
         (lambda s, m, p: setattr(p, "particle_y", 1), AttributeError, "nearest known name is 'particle_"),
         (lambda s, m, p: p.reset_state(p.particle_x, tensor_density=p.particle_mass), ValueError, "given together"),
@@ -289,11 +294,15 @@ def test_what_cannot_be_done_is_said(call, error, message):
 
 def test_a_material_without_its_parameters():
     solver, model, state = made({"material": "metal"})
-    with pytest.raises(ValueError, match="yield_stress of 'metal' must be positive"):
+    with pytest.raises(ValueError, match=r"yield_stress of 'metal' must be positive, got 0 for particle 0$"):
         solver.rollout(model, state, state, 1, DT)
     solver, model, state = made()
     model.mu = torch.zeros_like(model.mu)
     with pytest.raises(ValueError, match="mu must be positive: call set_E_nu and prepare_mu_lam"):
+        solver.rollout(model, state, state, 1, DT)
+    solver, model, state = made()
+    state.particle_vol = 0 * state.particle_vol
+    with pytest.raises(ValueError, match="volumes of the particles must be positive"):
         solver.rollout(model, state, state, 1, DT)
     fresh = MPMStateStruct()
     fresh.init(2)

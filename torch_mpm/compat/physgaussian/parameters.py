@@ -111,10 +111,17 @@ def _in_range(name: str, value: Any, like: Tensor) -> float | Tensor:
         raise ValueError(f"{name} must be a number, or have shape {shapes}, got {shape_of(tensor)}")
     values = tensor.detach()
     if not bool((holds(values) & values.isfinite()).all()):
-        raise ValueError(f"{name} must be {expected}, got {value}")
+        raise ValueError(f"{name} must be {expected}, got {_first(values, ~(holds(values) & values.isfinite()))}")
     if name == "rpic_damping" and tensor.requires_grad and bool(values < 0):
         raise ValueError(f"rpic_damping must not be negative where it requires grad, got {value}: PIC has no share")
     return tensor.reshape(()) if one else tensor
+
+
+def _first(values: Tensor, bad: Tensor) -> str:
+    """The first of some values that are bad, in words."""
+    k = int(bad.reshape(-1).int().argmax())
+    number = f"{float(values.reshape(-1)[k]):g}"
+    return f"{number} for particle {k}" if values.numel() > 1 else number
 
 
 def check_box(what: str, box: Mapping[str, Any], dialect: Dialect) -> None:
@@ -164,8 +171,9 @@ def check_material(material: str, kind: str, parameters: Mapping[str, Any]) -> l
             raise ValueError(f"material {material!r} needs {words}: give {name} in set_parameters_dict")
     limit = parameters.get("yield_stress")
     if "metal" in kind or kind == "plasticine":
-        if bool((torch.as_tensor(limit).detach() <= 0).any()):
-            raise ValueError(f"yield_stress of {material!r} must be positive, got {limit}")
+        values = torch.as_tensor(limit).detach()
+        if bool((values <= 0).any()):
+            raise ValueError(f"yield_stress of {material!r} must be positive, got {_first(values, values <= 0)}")
     effective = [name for name in (*needed, *optional) if name != "xi" or hardens(kind, parameters)]
     return effective
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import numbers
 import warnings
 from collections.abc import Sequence
 from typing import Any, ClassVar
@@ -92,8 +93,8 @@ class MPMSolver:
         length = float(check_number("size", size, "positive", lambda v: v > 0))
         self.dx = length / self.res[0]
         self.inv_dx = 1 / self.dx
-        self.default_dt = 2e-2 * self.dx / length * float(check_number("dt_scale", dt_scale))
-        self.E, self.nu = 1e6 * length * float(check_number("E_scale", E_scale)), materials.POISSON
+        self.default_dt = 2e-2 * self.dx / length * float(_positive_number("dt_scale", dt_scale))
+        self.E, self.nu = 1e6 * length * float(_positive_number("E_scale", E_scale)), materials.POISSON
         self.p_vol, self.p_rho = self.dx**self.dim, DENSITY
         self.p_mass = self.p_vol * DENSITY
         self.water_density = float(check_number("water_density", water_density, "positive", lambda v: v > 0))
@@ -120,7 +121,7 @@ class MPMSolver:
 
     def set_gravity(self, g: Sequence[float]) -> None:
         """Acceleration [m/s²], as many numbers as dimensions."""
-        self.gravity = check_vector("g", list(g), self.dim)
+        self.gravity = _vector("g", g, self.dim)
         self._step = None
 
     def add_bounding_box(self, unbounded: bool = False) -> None:
@@ -143,7 +144,7 @@ class MPMSolver:
         kind = self._kind(surface)
         if kind == "sticky" and friction != 0:
             raise ValueError(f"friction must be 0 on sticky surfaces, got {friction}")
-        at, n = check_vector("point", list(point), self.dim), check_vector("normal", list(normal), self.dim)
+        at, n = _vector("point", point, self.dim), _vector("normal", normal, self.dim)
         length = math.sqrt(sum(a * a for a in n))
         if length == 0:
             raise ValueError(f"normal must have a positive length, got {list(normal)}")
@@ -154,9 +155,7 @@ class MPMSolver:
     def add_sphere_collider(self, center: Sequence[float], radius: float, surface: int = 0) -> None:
         """Nodes in a ball stop (0), slip (1) or separate (2)."""
         number = check_number("radius", radius, "positive", lambda v: v > 0)
-        self.grid_postprocess.append(
-            Sphere(check_vector("center", list(center), self.dim), number, self._kind(surface))
-        )
+        self.grid_postprocess.append(Sphere(_vector("center", center, self.dim), number, self._kind(surface)))
 
     def clear_grid_postprocess(self) -> None:
         """Remove all colliders, the bounding box among them."""
@@ -201,8 +200,10 @@ class MPMSolver:
         velocity: Sequence[float] | None = None,
     ) -> None:
         """Particles at random positions in a box, sample_density in each cell, by default 2^D."""
-        corner = check_vector("lower_corner", list(lower_corner), self.dim)
-        edges = check_vector("cube_size", list(cube_size), self.dim)
+        corner = _vector("lower_corner", lower_corner, self.dim)
+        edges = _vector("cube_size", cube_size, self.dim)
+        if min(edges) < 0:
+            raise ValueError(f"cube_size must not be negative, got {list(edges)}")
         count = int(self._density(sample_density) * math.prod(edges) / self.p_vol + 1)
         self.add_particles(in_box(corner, edges, count), material, color, velocity)
 
@@ -216,12 +217,12 @@ class MPMSolver:
         velocity: Sequence[float] | None = None,
     ) -> None:
         """Particles at random positions in an ellipsoid with one radius, or one for each axis [m]."""
-        radii = [float(radius)] * self.dim if isinstance(radius, (int, float)) else list(radius)
-        halves = check_vector("radius", radii, self.dim)
+        radii = [radius] * self.dim if isinstance(radius, (int, float)) else radius
+        halves = _positive("radius", radii, self.dim)
         unit = math.pi if self.dim == 2 else 4 / 3 * math.pi
         volume = unit * math.prod(r * self.inv_dx for r in halves)
         count = math.ceil(volume * self._density(sample_density))
-        middle = check_vector("center", list(center), self.dim)
+        middle = _vector("center", center, self.dim)
         self.add_particles(in_ellipsoid(middle, halves, count), material, color, velocity)
 
     def add_ngon(
@@ -243,9 +244,10 @@ class MPMSolver:
         if self.dim != 2:
             raise ValueError("add_ngon needs a solver of 2 dimensions")
         check_count("sides", sides, 3)
+        radius, angle = float(_positive_number("radius", radius)), float(check_number("angle", angle))
         area = 0.5 * (radius * self.inv_dx) ** 2 * math.sin(2 * math.pi / sides) * sides
         count = math.ceil(area * self._density(sample_density))
-        points = in_polygon(check_vector("center", list(center), 2), float(radius), sides, float(angle), count)
+        points = in_polygon(_vector("center", center, 2), radius, sides, angle, count)
         self.add_particles(points, material, color, velocity)
 
     def add_texture_2d(
@@ -281,9 +283,10 @@ class MPMSolver:
         x = torch.as_tensor(particles, dtype=torch.float32, device=self.device)
         if x.dim() != 2 or x.shape[1] != self.dim:
             raise ValueError(f"particles must have shape [P, {self.dim}], got {shape_of(x)}")
-        start = (0.0,) * self.dim if velocity is None else check_vector("velocity", list(velocity), self.dim)
-        self._append(x, torch.tensor(start, device=x.device).expand_as(x), _ids(material, x), _ids(color, x))
-        self.emitter_ids = torch.cat([self.emitter_ids, _ids(emmiter_id, x)])
+        ids = [_ids(*pair, x) for pair in (("material", material), ("color", color), ("emmiter_id", emmiter_id))]
+        start = (0.0,) * self.dim if velocity is None else _vector("velocity", velocity, self.dim)
+        self._append(x, torch.tensor(start, device=x.device).expand_as(x), ids[0], ids[1])
+        self.emitter_ids = torch.cat([self.emitter_ids, ids[2]])
 
     def read_restart(self, num_particles: int, pos: Any, vel: Any, material: Any, color: Any) -> None:
         """Particles with positions and velocities [P, D], materials and colors [P], undeformed."""
@@ -295,9 +298,20 @@ class MPMSolver:
         self.emitter_ids = torch.cat([self.emitter_ids, torch.zeros_like(kinds)])
 
     def _density(self, given: float | None) -> float:
-        return 2.0**self.dim if given is None else float(check_number("sample_density", given))
+        return 2.0**self.dim if given is None else float(_positive_number("sample_density", given))
 
     def _append(self, x: Tensor, v: Tensor, material: Tensor, color: Tensor) -> None:
+        for name, value in (("positions", x), ("velocities", v)):
+            if value.shape != (len(x), self.dim):
+                raise ValueError(f"{name} must have shape [P, D] = [{len(x)}, {self.dim}], got {shape_of(value)}")
+            if not bool(value.isfinite().all()):
+                row = int(value.isfinite().all(1).int().argmin())
+                raise ValueError(f"{name} must be finite, got {value[row].tolist()} for particle {row}")
+        for name, ids in (("material", material), ("color", color)):
+            if ids.shape != x.shape[:1]:
+                raise ValueError(f"{name} must have shape [P] = [{len(x)}], got {shape_of(ids)}")
+        if len(x) == 0:
+            return
         for number in material.unique().tolist():
             materials.law_of(number, self.E, self.dim, self.support_plasticity)
         mass = torch.where(material == self.material_water, self.water_density, 1.0).to(x) * self.p_mass
@@ -379,7 +393,28 @@ def _check_storage(given: dict[str, Any]) -> None:
         warnings.warn(f"options of Taichi's storage and kernels have no effect: {', '.join(changed)}", stacklevel=3)
 
 
-def _ids(value: int, x: Tensor) -> Tensor:
+def _vector(name: str, value: Any, dim: int) -> tuple[float, ...]:
+    """Finite numbers from anything that has as many of them as dimensions: a list, an array, a tensor, a vector of
+    Taichi.
+    """
+    return check_vector(name, value if hasattr(value, "tolist") else list(value), dim)
+
+
+def _positive(name: str, value: Any, dim: int) -> tuple[float, ...]:
+    """`_vector` of positive numbers."""
+    found = _vector(name, value, dim)
+    if min(found) <= 0:
+        raise ValueError(f"{name} must be positive on every axis, got {list(found)}")
+    return found
+
+
+def _positive_number(name: str, value: Any) -> Any:
+    return check_number(name, value, "positive and finite", lambda v: 0 < v < math.inf)
+
+
+def _ids(name: str, value: int, x: Tensor) -> Tensor:
+    if isinstance(value, bool) or not isinstance(value, numbers.Integral):
+        raise TypeError(f"{name} must be a whole number, got {shape_of(value)}")
     return torch.full((len(x),), value, dtype=torch.int32, device=x.device)
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ...cuda_graphs.capture import version
-from ...errors import check_count, check_like, check_number, shape_of
+from ...errors import FLOATING, check_count, check_like, check_number, shape_of
 from ..constitutive import engineering, lame
 from ..keys import nearest
 from ..selections import chosen
@@ -136,6 +136,8 @@ class MPMStateStruct(_Struct):
         x = _given(tensor_x, device, requires_grad)
         if x.dim() != 2 or x.shape[1] != 3:
             raise ValueError(f"tensor_x must have shape [P, 3], got {shape_of(x)}")
+        if x.dtype not in FLOATING:
+            raise TypeError(f"tensor_x must be float32 or float64, got {x.dtype}")
         if not self.known("particle_x") or len(self.particle_x) != len(x):
             self.init(len(x), x.device)
         self._convert(x)

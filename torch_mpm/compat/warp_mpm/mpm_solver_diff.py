@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ...cuda_graphs.capture import version
-from ...errors import check_count, check_flag, check_number
+from ...errors import check_count, check_flag, check_number, shape_of
 from ...grid.grid import Grid
 from ...state.state import State
 from ..clipping import ClippedRollout
@@ -27,6 +27,7 @@ from .mpm_data_structure import MPMModelStruct, MPMStateStruct
 DIALECT = DIALECTS["warp_mpm"]
 OF_THE_MODEL = {"E": "call set_E_nu", "nu": "call set_E_nu", "n_grid": "call init_other_params of the model"}
 OF_THE_MODEL |= {"grid_lim": OF_THE_MODEL["n_grid"]}
+OF_THE_MODEL |= dict.fromkeys(("gamma", "kappa"), "the law of MPMAvatar's cloth does not exist here")
 KEYS = [key for key in BASE_KEYS if key not in (*OF_THE_MODEL, "additional_material_params")]
 MARGIN = 2.0
 """Distance of positions from the faces of the domain after each step, in cells."""
@@ -180,6 +181,7 @@ class MPMWARPDiff(ParticleConditions):
             dt: [s]
             checkpoint: states to store for the backward pass, see `torch_mpm.rollout`.
         """
+        _check_structs(mpm_model, mpm_state=mpm_state, next_state=next_state)
         check_count("n", n)
         dt = float(check_number("dt", dt, "positive", lambda v: v > 0))
         self._before_change()
@@ -204,6 +206,7 @@ class MPMWARPDiff(ParticleConditions):
         """A step of dt [s] of a state in place; `step` is not used. Steps are computed together when something is read
         or changed.
         """
+        _check_structs(mpm_model, mpm_state=mpm_state)
         check_number("dt", dt, "positive", lambda v: v > 0)
         if self._queue is not None:
             model, state, n, before, grad = self._queue
@@ -238,6 +241,8 @@ class MPMWARPDiff(ParticleConditions):
         if len(struct.particle_x) != self.n_particles:
             raise ValueError(f"the state must have {self.n_particles} particles, got {len(struct.particle_x)}")
         mass, volume = struct.particle_mass, struct.particle_vol
+        if not bool((volume.detach() > 0).all()):
+            raise ValueError("the volumes of the particles must be positive: give them in from_torch")
         if not bool((mass.detach() > 0).all()):
             raise ValueError("the particles have no mass: give density in set_parameters_dict, or call reset_density")
         x, v, C, F = (getattr(struct, name) for name in ("particle_x", "particle_v", "particle_C", "particle_F_trial"))
@@ -275,3 +280,12 @@ class MPMWARPDiff(ParticleConditions):
 
     def _nodes(self, model: MPMModelStruct, x: Tensor) -> Nodes:
         return Nodes(model.dx, (model.n_grid,) * 3, x[:0], self.strict)
+
+
+def _check_structs(model: MPMModelStruct, **states: MPMStateStruct) -> None:
+    """Raise TypeError for other structs."""
+    if not isinstance(model, MPMModelStruct):
+        raise TypeError(f"mpm_model must be an MPMModelStruct, got {shape_of(model)}")
+    for name, state in states.items():
+        if not isinstance(state, MPMStateStruct):
+            raise TypeError(f"{name} must be an MPMStateStruct, got {shape_of(state)}")
