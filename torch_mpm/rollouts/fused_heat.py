@@ -116,7 +116,8 @@ def heat_arguments(step: Step, state: State) -> tuple[Any, ...]:
     values = []
     for name, value in zip(names, _values(heat), strict=False):
         check_length(name, value, len(state), scenes)
-        number = evaluate(name, value, state) if isinstance(value, PerMaterial) else value
+        of_particles = isinstance(value, PerMaterial) or getattr(value, "shape", None) == (len(state),)
+        number = evaluate(name, value, state) if of_particles else value  # in the order of the particles
         values.append(torch.as_tensor(number, dtype=temperature.dtype, device=temperature.device))
     melting = [state.extra[LIQUID], *values[2:]] if heat.melts else []
     gradient = state.extra[GRADIENT] if heat.affine else None
