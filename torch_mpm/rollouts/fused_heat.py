@@ -59,6 +59,8 @@ def _why_not_held(step: Step, heat: Heat) -> str | None:
         value = term.temperature
         if _is_function(value) or (isinstance(value, Tensor) and value.requires_grad):
             return f"the temperature of {name} is a function, or requires a gradient"
+        if isinstance(value, Tensor) and value.shape not in ((), (1,), (step.grid.scenes,)):
+            return f"the temperature of {name} has other values than one for each scene"
     if sum([type(term) is FixedSurface for term in heat.boundaries.entries]) > 1:
         return "several surfaces are held"
     return None
