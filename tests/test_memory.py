@@ -97,6 +97,16 @@ def test_an_installed_package_is_not_called_missing(monkeypatch, error, kind, me
         optional.load("foreign.part", "pictures", "render")
 
 
+def test_an_interrupt_during_an_import_waits_for_its_end(monkeypatch, tmp_path):
+    """Packages in C++ turn it into another error."""
+    (tmp_path / "foreign.py").write_text("import signal\nsignal.raise_signal(signal.SIGINT)\ncomplete = True\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "foreign", raising=False)
+    with pytest.raises(KeyboardInterrupt):
+        optional.load("foreign", "pictures", "render")
+    assert sys.modules.pop("foreign").complete
+
+
 def test_the_command_line_says_what_was_wanted(monkeypatch, capsys):
     def command(options):
         torch.empty(2**60, dtype=torch.int8)

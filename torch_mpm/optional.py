@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import importlib
+import sys
 from typing import Any
 
 from .data import host_memory
+from .interrupts import held_signals
 
 
 def load(module: str, purpose: str, extra: str) -> Any:
@@ -22,7 +24,10 @@ def load(module: str, purpose: str, extra: str) -> Any:
     """
     package = module.partition(".")[0]
     try:
-        return importlib.import_module(module)
+        if module in sys.modules:
+            return importlib.import_module(module)
+        with held_signals():  # An import in C++ turns an interrupt into another error, or is incomplete after it.
+            return importlib.import_module(module)
     except (ImportError, OSError, MemoryError, RuntimeError) as error:
         if host_memory.is_short(error):
             raise MemoryError(f"{purpose}: too little memory to import {package} ({error})") from error

@@ -445,3 +445,27 @@ def test_absent_particles_and_those_outside_keep_their_heat(dim, transfer):
     ):
         assert torch.equal(before[absent], after[absent])
     assert not torch.equal(state.temperature[~absent], single.temperature[~absent])
+
+
+@pytest.mark.parametrize("melts", [False, True])
+def test_parameters_of_particles_in_another_order(dim, melts):
+    """Values of particles belong to their ids."""
+    step, state = scene(dim, melts=melts, per_particle=True)
+    order = torch.randperm(len(state), generator=torch.Generator().manual_seed(3))
+    permuted = state.select(order).replace(ids=order)
+    end = compare(step, permuted)
+    with torch.no_grad():
+        expected = mpm.rollout(step, state, 12, DT).temperature
+    torch.testing.assert_close(end.temperature, expected[order], rtol=0, atol=1e-7)
+
+
+def test_temperatures_of_nodes_go_step_by_step():
+    ends = []
+    for run in (mpm.rollout, composed):
+        step, state = scene(2)
+        nodes = step.grid.activate(state.x).node_count
+        held(step, (heat_boundaries.Fixed, mpm.Sphere((0.4, 0.4), 0.1), torch.linspace(1.0, 50.0, nodes).double()))
+        with torch.no_grad():
+            ends.append(run(step, state, 3, DT).temperature)
+    assert "other values than one for each scene" in plan_rollout(step, state, 3, DT).reasons["fused"]
+    assert torch.equal(*ends)

@@ -143,7 +143,7 @@ def test_no_particles_have_an_empty_surface():
     [
         (np.zeros((4, 2)), {}, r"x must have shape \[P, 3\], got \[4, 2\]; a surface needs three dimensions"),
         (np.full((4, 3), np.nan), {}, "x must be finite, got 4 particles that are not"),
-        (np.array([[0, 0, 0], [1e30, 0, 0]]), {}, "pysplashsurf finds no surface of 2 particles"),
+        (np.array([[0, 0, 0], [1e7, 1e7, 1e7]]), {}, "pysplashsurf finds no surface of 2 particles"),
         (np.zeros((4, 3)), {"cube_size": 1.0}, r"cube_size must be within .* got 1 m"),
         (np.zeros((4, 3)), {"cube_size": 1e-9}, r"cube_size must be within .* got 1e-09 m"),
         (np.zeros((4, 3)), {"smoothing_length": 1.0}, r"smoothing_length must be within 0.01 m and 0.08 m"),
@@ -411,6 +411,7 @@ def test_a_data_set_is_refused(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
+<<<<<<< HEAD
     "labels",
     [
         ["water", "Water", "water 1"],
@@ -423,3 +424,37 @@ def test_a_data_set_is_refused(tmp_path, capsys):
 def test_file_names_of_groups_differ(labels):
     names = different_names(labels)
     assert len(set(names)) == len(labels) and all(re.fullmatch(r"\w+", name) for name in names)
+=======
+    ("words", "error", "message"),
+    [
+        ({"x": ball().astype(int)}, TypeError, "x must be an array of float32 or float64, got int64"),
+        ({"x": ball().astype(np.float16)}, TypeError, "x must be an array of float32 or float64, got float16"),
+        ({"x": ball().tolist()}, TypeError, "x must be an array of float32 or float64, got list"),
+        (
+            {"x": np.array([[0.0, 0.0, 0.0], [1e9, 0.0, 0.0]])},
+            ValueError,
+            "the particles are spread over 6.67e.10 cubes",
+        ),
+        ({"spacing": 0.0}, ValueError, "spacing must be positive and finite, got 0"),
+        ({"dx": -1.0}, ValueError, "dx must be positive and finite, got -1"),
+        ({"options": {"smoothing": 3}}, TypeError, "options must be SurfaceOptions or None, got dict"),
+    ],
+)
+def test_wrong_arguments_of_a_reconstruction(words, error, message):
+    with pytest.raises(error, match=message):
+        surfaces.reconstruct(**{"x": ball(), "spacing": SPACING, "dx": 2 * SPACING, **words})
+
+
+@pytest.mark.parametrize(
+    ("words", "error", "message"),
+    [
+        ({"formats": "ply"}, TypeError, "formats must be a list of names, got str 'ply'"),
+        ({"materials": "rubber"}, TypeError, "materials must be a list of names, got str 'rubber'"),
+        ({"formats": []}, ValueError, "formats must have at least one of ply, obj, vtp, got none"),
+    ],
+)
+def test_lists_of_names_of_an_export(run, tmp_path, words, error, message):
+    with pytest.raises(error, match=message):
+        surfaces.export_surfaces(run, tmp_path / "out", **words)
+    assert list(tmp_path.iterdir()) == []
+>>>>>>> newcomer

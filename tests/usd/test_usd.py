@@ -25,6 +25,7 @@ from torch_mpm.cli import main  # noqa: E402
 from torch_mpm.render.camera import framing  # noqa: E402
 from torch_mpm.scene.folder import load_run  # noqa: E402
 from torch_mpm.scene.places import obstacle  # noqa: E402
+from torch_mpm.surfaces import SurfaceOptions  # noqa: E402
 from torch_mpm.usd import prims, stage  # noqa: E402
 
 FRAMES = 3
@@ -332,6 +333,21 @@ def test_wrong_options(run, tmp_path, capsys, words, message):
     printed = capsys.readouterr().err
     assert message in printed and len(printed.splitlines()) == 1
     assert sorted(os.listdir(run)) == before and list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "error", "message"),
+    [
+        ({"materials": ["rubber"]}, ValueError, "surface must be True where options or materials are given"),
+        ({"options": SurfaceOptions(smoothing=5)}, ValueError, "surface must be True where options or materials"),
+        ({"surface": True, "materials": "rubber"}, TypeError, "materials must be a list of names, got str 'rubber'"),
+        ({"grains": "no"}, TypeError, "grains must be True or False, got str"),
+    ],
+)
+def test_wrong_arguments_of_an_export(run, tmp_path, words, error, message):
+    with pytest.raises(error, match=message):
+        usd.export_usd(run, tmp_path / "a.usdc", **words)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_run_in_two_dimensions_is_refused(tmp_path, capsys):

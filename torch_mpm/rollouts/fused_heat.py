@@ -57,6 +57,7 @@ def why_not_fused_heat(step: Step, state: State, n: int, dt: float | Tensor) -> 
     return None
 
 
+<<<<<<< HEAD
 HELD = (Fixed, FixedSurface)
 NUMBERS: dict[type, tuple[str, ...]] = {
     Flux: ("flux",),
@@ -85,6 +86,23 @@ def _why_not_boundaries(step: Step, heat: Heat) -> str | None:
     for kind, reason in ((FixedSurface, "several surfaces are held"), (Source, "there are several sources of heat")):
         if sum([type(term) is kind for term in terms]) > 1:
             return reason
+=======
+def _why_not_held(step: Step, heat: Heat) -> str | None:
+    """Reason why the op does not hold the temperatures of the boundaries; None if it does."""
+    for term in heat.boundaries.entries:
+        name = type(term).__name__
+        if type(term) not in (Fixed, FixedSurface):
+            return f"its heat has a boundary that is not held, {name}"
+        if not any(term.region is obstacle for obstacle in step.boundaries.entries):
+            return f"the region of {name} is no obstacle of the step"
+        value = term.temperature
+        if _is_function(value) or (isinstance(value, Tensor) and value.requires_grad):
+            return f"the temperature of {name} is a function, or requires a gradient"
+        if isinstance(value, Tensor) and value.shape not in ((), (1,), (step.grid.scenes,)):
+            return f"the temperature of {name} has other values than one for each scene"
+    if sum([type(term) is FixedSurface for term in heat.boundaries.entries]) > 1:
+        return "several surfaces are held"
+>>>>>>> newcomer
     return None
 
 
@@ -166,7 +184,8 @@ def heat_arguments(step: Step, state: State) -> tuple[Any, ...]:
     values = []
     for name, value in zip(names, _values(heat), strict=False):
         check_length(name, value, len(state), scenes)
-        number = evaluate(name, value, state) if isinstance(value, PerMaterial) else value
+        of_particles = isinstance(value, PerMaterial) or getattr(value, "shape", None) == (len(state),)
+        number = evaluate(name, value, state) if of_particles else value  # in the order of the particles
         values.append(torch.as_tensor(number, dtype=temperature.dtype, device=temperature.device))
     melting = [state.extra[LIQUID], *values[2:]] if heat.melts else []
     gradient = [state.extra[GRADIENT]] if heat.affine else []

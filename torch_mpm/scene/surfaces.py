@@ -14,13 +14,14 @@ from ..data.export import CollectedFile, write_collection
 from ..data.trajectory import Array, Trajectory
 from ..data.whole_files import output_folder, output_path
 from ..errors import check_count
-from ..surfaces.files import require_writer, write_surface
+from ..surfaces.files import PACKAGES, require_writer, write_surface
 from ..surfaces.interpolation import Interpolation
 from ..surfaces.reconstruction import (
     Lengths,
     Surface,
     SurfaceError,
     SurfaceOptions,
+    checked_options,
     reconstruct,
     require_packages,
 )
@@ -95,7 +96,7 @@ class RunSurfaces:
         dim = trajectory.file["position"].shape[2]
         if dim != 3:
             raise SurfaceError(f"{trajectory.path}: a surface needs three dimensions; this run has {dim}")
-        self.options = options or SurfaceOptions()
+        self.options = checked_options(options)
         self.dx, self.origin = scene.grid.dx, origin
         self.lower, self.upper = (np.array(corner) for corner in (scene.grid.lower, scene.grid.upper))
         names = trajectory.names("material")
@@ -129,6 +130,13 @@ class RunSurfaces:
         return GroupSurface(group, surface, rows, interpolation)
 
 
+def check_names(**lists: Any) -> None:
+    """Raise TypeError for a text in place of a list of names."""
+    for name, value in lists.items():
+        if isinstance(value, str):
+            raise TypeError(f"{name} must be a list of names, got str {value!r}")
+
+
 def export_surfaces(
     run: str | Path,
     out: str | Path | None = None,
@@ -155,10 +163,14 @@ def export_surfaces(
     Raises:
         FileNotFoundError: when the folder has no run, or no frame yet.
         DamagedFileError: for a run that is damaged, or a link out of its folder in place of the output.
-        SurfaceError, ImportError: as `RunSurfaces`; also for an unknown format, and a missing package of a format.
-        ValueError, TypeError: for ``every``.
+        SurfaceError, ImportError: as `RunSurfaces`; also without a format, for an unknown one, and a missing package of
+            a format.
+        ValueError, TypeError: for ``every``, and for a text in place of a list of names.
     """
     check_count("every", every, 1)
+    check_names(formats=formats, materials=materials)
+    if not formats:
+        raise SurfaceError(f"formats must have at least one of {', '.join(PACKAGES)}, got none")
     for name in formats:
         require_writer(name)
     scene = load_run(run)

@@ -11,12 +11,12 @@ import numpy as np
 
 from ..data.trajectory import Array, Trajectory
 from ..data.whole_files import output_path, remove_leftovers
-from ..errors import check_count
+from ..errors import check_count, check_flag
 from ..geometry.surface_mesh import frame_of
 from ..render.boundaries import obstacle_shapes
 from ..render.camera import framing, up_axis
 from ..render.colors import palette_colors
-from ..surfaces.reconstruction import SurfaceOptions
+from ..surfaces.reconstruction import SurfaceOptions, checked_options
 from ..usd.prims import Grains, Mesh, Points, RigidPiece, linear, write_camera, write_group, write_rigid
 from ..usd.stage import SUFFIXES, Stage, UsdError, child_path, new_stage, pxr
 from . import schema
@@ -24,7 +24,7 @@ from .folder import load_run
 from .groups import Group, groups_of
 from .places import obstacle
 from .scene import Scene
-from .surfaces import RunSurfaces
+from .surfaces import RunSurfaces, check_names
 
 log = logging.getLogger(__name__)
 
@@ -68,9 +68,14 @@ def export_usd(
         SurfaceError: as `RunSurfaces`.
         ImportError: when usd-core is missing (extra ``usd``), or with ``surface`` a package of its extra.
         OSError: when the file cannot be written; nothing remains of it.
-        ValueError, TypeError: for ``every``.
+        ValueError, TypeError: for ``every``, options or materials without ``surface``, and flags that are none.
     """
     check_count("every", every, 1)
+    check_flag("grains", grains)
+    check_names(materials=materials)
+    given = checked_options(options) != SurfaceOptions() or len(materials) > 0
+    if not check_flag("surface", surface) and given:
+        raise ValueError("surface must be True where options or materials are given, got False")
     pxr("Usd")
     scene = load_run(run)
     path = output_path(Path(run), FILE, out)

@@ -32,6 +32,10 @@ MOST_STEPS = 100
 """Maximum number of steps of the smoothing of a mesh."""
 
 
+MOST_CUBES = 2**30
+"""Maximum number of cubes along an axis, which pysplashsurf counts in 32 bits."""
+
+
 class SurfaceError(ValueError):
     """Particles or options without a surface."""
 
@@ -98,6 +102,13 @@ class Lengths(NamedTuple):
     cube: float
 
 
+def checked_options(options: SurfaceOptions | None) -> SurfaceOptions:
+    """The given options, or the defaults; TypeError for anything else."""
+    if options is not None and not isinstance(options, SurfaceOptions):
+        raise TypeError(f"options must be SurfaceOptions or None, got {type(options).__name__}")
+    return options or SurfaceOptions()
+
+
 def _require_within(name: str, value: float, ends: tuple[float, float], unit: float, of: str) -> None:
     low, high = (end * unit for end in ends)
     if not low <= value <= high:
@@ -134,10 +145,17 @@ def reconstruct(x: Array, spacing: float, dx: float, options: SurfaceOptions | N
         The mesh, empty without particles. Computed in float32, relative to the lower corner of the particles.
 
     Raises:
-        SurfaceError: for positions of another shape or that are not finite, or options that do not suit the spacing.
+        SurfaceError: for positions of another shape, that are not finite or too far apart, or options that do not suit
+            the spacing.
+        TypeError, ValueError: for another type or dtype, or lengths that are not positive.
         ImportError: when pysplashsurf is missing (extra ``surface``).
     """
-    lengths = (options or SurfaceOptions()).lengths(spacing, dx)
+    if not isinstance(x, np.ndarray) or x.dtype not in (np.float32, np.float64):
+        raise TypeError(f"x must be an array of float32 or float64, got {getattr(x, 'dtype', type(x).__name__)}")
+    for name, value in (("spacing", spacing), ("dx", dx)):
+        check_number(name, value, "positive and finite", lambda number: 0 < number < np.inf)
+    options = checked_options(options)
+    lengths = options.lengths(spacing, dx)
     if x.ndim != 2 or x.shape[1] != 3:
         raise SurfaceError(f"x must have shape [P, 3], got {list(x.shape)}; a surface needs three dimensions")
     if not np.isfinite(x).all():
@@ -145,7 +163,9 @@ def reconstruct(x: Array, spacing: float, dx: float, options: SurfaceOptions | N
     if not len(x):
         return Surface(np.zeros((0, 3), x.dtype), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
     lower = x.min(0)
-    mesh = _pipeline(np.ascontiguousarray(x - lower, np.float32), lengths, options or SurfaceOptions())
+    if (cubes := float((x.max(0) - lower).max() / lengths.cube)) > MOST_CUBES:
+        raise SurfaceError(f"the particles are spread over {cubes:.3g} cubes of {lengths.cube:.4g} m along an axis")
+    mesh = _pipeline(np.ascontiguousarray(x - lower, np.float32), lengths, options)
     return Surface(
         lower + np.asarray(mesh.mesh.vertices).astype(x.dtype),
         np.asarray(mesh.mesh.triangles).astype(np.int32),
