@@ -250,11 +250,7 @@ def test_a_restart_continues():
         (
             lambda: MPMSolver((8, 8)).add_cube((0, 0), (-1, 1), 1),
             ValueError,
-<<<<<<< HEAD
-            "cube_size must be positive on every axis",
-=======
             "cube_size must not be negative",
->>>>>>> newcomer
         ),
         (
             lambda: MPMSolver((8, 8)).add_cube((0, 0), (1, 1), 1, sample_density=-1),
@@ -297,11 +293,5 @@ def test_no_particles_are_added_and_tensors_are_vectors():
     solver.set_gravity(torch.tensor([0.0, -1.0]))
     solver.add_cube((0.4, 0.4), (0.2, 0.2), MPMSolver.material_elastic, velocity=torch.tensor([0.5, 0.0]))
     solver.step(1e-3)
-<<<<<<< HEAD
-    assert (
-        np.isfinite(solver.particle_info()["velocity"]).all() and solver.particle_info()["velocity"][:, 0].min() > 0.4
-    )
-=======
     velocity = solver.particle_info()["velocity"]
     assert len(velocity) and velocity[:, 0].min() > 0.1 and velocity[:, 1].max() < 0
->>>>>>> newcomer

@@ -451,6 +451,7 @@ def test_absent_particles_and_those_outside_keep_their_heat(dim, transfer):
 def test_parameters_of_particles_in_another_order(dim, melts):
     """Values of particles belong to their ids."""
     step, state = scene(dim, melts=melts, per_particle=True)
+    step.heat.boundaries = [heat_boundaries.Source(1e8 * (1 + state.x[:, 0]))]
     order = torch.randperm(len(state), generator=torch.Generator().manual_seed(3))
     permuted = state.select(order).replace(ids=order)
     end = compare(step, permuted)

@@ -1,7 +1,6 @@
 """Surfaces of particles: volume, velocity and normals against exact values, their files, and wrong inputs."""
 
 import json
-import re
 import shutil
 import sys
 
@@ -21,7 +20,6 @@ from torch_mpm.cli import main  # noqa: E402
 from torch_mpm.scene import pictures  # noqa: E402
 from torch_mpm.scene import surfaces as run_surfaces  # noqa: E402
 from torch_mpm.scene.folder import load_run  # noqa: E402
-from torch_mpm.scene.groups import different_names  # noqa: E402
 from torch_mpm.surfaces import files  # noqa: E402
 
 SAND = """
@@ -411,20 +409,6 @@ def test_a_data_set_is_refused(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-<<<<<<< HEAD
-    "labels",
-    [
-        ["water", "Water", "water 1"],
-        ["a/b", "a:b", "a_b_1"],
-        ["a", "a", "a 0", "a 1"],
-        ["", "*", "unnamed 1"],
-        ["a", "b"],
-    ],
-)
-def test_file_names_of_groups_differ(labels):
-    names = different_names(labels)
-    assert len(set(names)) == len(labels) and all(re.fullmatch(r"\w+", name) for name in names)
-=======
     ("words", "error", "message"),
     [
         ({"x": ball().astype(int)}, TypeError, "x must be an array of float32 or float64, got int64"),
@@ -457,4 +441,3 @@ def test_lists_of_names_of_an_export(run, tmp_path, words, error, message):
     with pytest.raises(error, match=message):
         surfaces.export_surfaces(run, tmp_path / "out", **words)
     assert list(tmp_path.iterdir()) == []
->>>>>>> newcomer

@@ -57,7 +57,6 @@ def why_not_fused_heat(step: Step, state: State, n: int, dt: float | Tensor) -> 
     return None
 
 
-<<<<<<< HEAD
 HELD = (Fixed, FixedSurface)
 NUMBERS: dict[type, tuple[str, ...]] = {
     Flux: ("flux",),
@@ -81,28 +80,13 @@ def _why_not_boundaries(step: Step, heat: Heat) -> str | None:
             value = getattr(term, name)
             if _is_function(value) or (isinstance(value, Tensor) and value.requires_grad):
                 return f"{name} of {type(term).__name__} is a function, or requires a gradient"
-            if type(term) in NUMBERS and isinstance(value, Tensor) and value.numel() not in (1, heat.grid.scenes):
-                return f"{name} of {type(term).__name__} has a value for each node"
+            if type(term) is Source or not isinstance(value, Tensor):
+                continue
+            if value.shape not in ((), (1,), (heat.grid.scenes,)):
+                return f"{name} of {type(term).__name__} has other values than one for each scene"
     for kind, reason in ((FixedSurface, "several surfaces are held"), (Source, "there are several sources of heat")):
         if sum([type(term) is kind for term in terms]) > 1:
             return reason
-=======
-def _why_not_held(step: Step, heat: Heat) -> str | None:
-    """Reason why the op does not hold the temperatures of the boundaries; None if it does."""
-    for term in heat.boundaries.entries:
-        name = type(term).__name__
-        if type(term) not in (Fixed, FixedSurface):
-            return f"its heat has a boundary that is not held, {name}"
-        if not any(term.region is obstacle for obstacle in step.boundaries.entries):
-            return f"the region of {name} is no obstacle of the step"
-        value = term.temperature
-        if _is_function(value) or (isinstance(value, Tensor) and value.requires_grad):
-            return f"the temperature of {name} is a function, or requires a gradient"
-        if isinstance(value, Tensor) and value.shape not in ((), (1,), (step.grid.scenes,)):
-            return f"the temperature of {name} has other values than one for each scene"
-    if sum([type(term) is FixedSurface for term in heat.boundaries.entries]) > 1:
-        return "several surfaces are held"
->>>>>>> newcomer
     return None
 
 
@@ -123,10 +107,7 @@ def _terms(heat: Heat, state: State) -> tuple[list[int], Tensor, Tensor]:
             values[0] = STEFAN_BOLTZMANN * values[0]
         rows.append(torch.stack([values[0], values[-1]], 1))
     power = next((term.power for term in terms if type(term) is Source), None)
-    if power is not None:
-        check_length("power", power, len(state), scenes)
-        power = evaluate("power", power, state) if isinstance(power, PerMaterial) else power
-    of_source = like.new_empty(0) if power is None else torch.as_tensor(power, dtype=like.dtype, device=like.device)
+    of_source = like.new_empty(0) if power is None else _tensor("power", power, state, scenes)
     numbers = torch.stack(rows).contiguous() if rows else like.new_empty(0)
     return [kinds.index(type(term)) for term in surfaces], numbers, of_source
 
@@ -174,6 +155,18 @@ def _fields(heat: Heat, state: State) -> tuple[Tensor | None, ...]:
     return state.temperature, state.extra.get(GRADIENT), state.extra.get(LIQUID)
 
 
+def _tensor(name: str, value: Any, state: State, scenes: int) -> Tensor:
+    """A parameter as the op takes it; values of particles in the order of the state.
+
+    Raises:
+        ValueError: for another shape.
+    """
+    check_length(name, value, len(state), scenes)
+    of_particles = isinstance(value, PerMaterial) or getattr(value, "shape", None) == (len(state),)
+    number = evaluate(name, value, state) if of_particles else value
+    return torch.as_tensor(number, dtype=state.mass.dtype, device=state.mass.device)
+
+
 def heat_arguments(step: Step, state: State) -> tuple[Any, ...]:
     """The arguments of the op from `heat` to `heat_boundaries`."""
     heat = step.heat
@@ -181,12 +174,7 @@ def heat_arguments(step: Step, state: State) -> tuple[Any, ...]:
         return [], [], [], [], [], []
     temperature, scenes = needed_temperature(state), heat.grid.scenes
     names = ("conductivity", "specific_heat", "melting_point", "latent_heat")
-    values = []
-    for name, value in zip(names, _values(heat), strict=False):
-        check_length(name, value, len(state), scenes)
-        of_particles = isinstance(value, PerMaterial) or getattr(value, "shape", None) == (len(state),)
-        number = evaluate(name, value, state) if of_particles else value  # in the order of the particles
-        values.append(torch.as_tensor(number, dtype=temperature.dtype, device=temperature.device))
+    values = [_tensor(name, v, state, scenes) for name, v in zip(names, _values(heat), strict=False)]
     melting = [state.extra[LIQUID], *values[2:]] if heat.melts else []
     gradient = [state.extra[GRADIENT]] if heat.affine else []
     numbers, surface, temperatures = _held(step, state.x)
