@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import os
+import re
 import resource
 import shutil
 import signal
@@ -300,6 +301,12 @@ def test_a_full_disk_is_reported_in_one_line(run, tmp_path):
     _, errors = process.communicate()
     assert process.returncode == 1 and list(tmp_path.iterdir()) == [], errors
     assert errors == f"torch-mpm: {tmp_path / 'a.usdc'}: USD cannot write the file: File too large\n"
+
+
+@pytest.mark.parametrize("suffix", stage.SUFFIXES)
+def test_a_file_that_cannot_be_made_is_reported_in_one_line(run, capsys, suffix):
+    assert main(["usd", str(run), "-o", f"/proc/a{suffix}", "--quiet"]) == 1
+    assert re.fullmatch(rf"torch-mpm: /proc/a{suffix}: .*\n", capsys.readouterr().err)
 
 
 # ---- wrong inputs

@@ -48,8 +48,12 @@ class Stage:
             last: number of the last frame.
             up: upward axis, "Y" or "Z".
             title: documentation of the file.
+
+        Raises:
+            OSError: when USD cannot make the file.
         """
-        self.stage = pxr("Usd").Stage.CreateNew(str(path))
+        with _errors_of(path):
+            self.stage = pxr("Usd").Stage.CreateNew(str(path))
         self.stage.SetStartTimeCode(0)
         self.stage.SetEndTimeCode(last)
         self.stage.SetTimeCodesPerSecond(rate)
@@ -74,14 +78,21 @@ class Stage:
         Raises:
             OSError: when USD cannot write them.
         """
-        error = pxr("Tf").ErrorException
-        try:
+        with _errors_of(self._path):
             saved = self.stage.GetRootLayer().Save()
-        except error as failure:
-            raise OSError(errno.EIO, _reason(failure), str(self._path)) from failure
         if not saved:
             raise OSError(errno.EIO, "USD cannot write the file", str(self._path))
         self._unsaved = 0
+
+
+@contextlib.contextmanager
+def _errors_of(path: Path) -> Iterator[None]:
+    """Errors of USD in the block are an OSError of a file."""
+    error = pxr("Tf").ErrorException
+    try:
+        yield
+    except error as failure:
+        raise OSError(errno.EIO, _reason(failure), str(path)) from failure
 
 
 def _reason(error: Exception) -> str:
