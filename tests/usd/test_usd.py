@@ -303,6 +303,27 @@ def test_a_full_disk_is_reported_in_one_line(run, tmp_path):
     assert errors == f"torch-mpm: {tmp_path / 'a.usdc'}: USD cannot write the file: File too large\n"
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_waits_for_an_import_of_usd(monkeypatch, number):
+    done = []
+
+    def load(*arguments):
+        signal.raise_signal(number)
+        done.append(arguments[0])
+
+    def end(*_):
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(stage.optional, "load", load)
+    before = signal.signal(number, end)
+    try:
+        with pytest.raises(ZeroDivisionError):
+            stage.pxr("NotImportedYet")
+    finally:
+        signal.signal(number, before)
+    assert done == ["pxr.NotImportedYet"]
+
+
 @pytest.mark.parametrize("suffix", stage.SUFFIXES)
 def test_a_file_that_cannot_be_made_is_reported_in_one_line(run, capsys, suffix):
     assert main(["usd", str(run), "-o", f"/proc/a{suffix}", "--quiet"]) == 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import re
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ import numpy as np
 from .. import optional
 from ..data.trajectory import Array
 from ..data.whole_files import replacing
+from ..interrupts import held_signals
 
 SUFFIXES = (".usdc", ".usda", ".usd")
 SAVED_BYTES = 2**26
@@ -28,8 +30,10 @@ class UsdError(ValueError):
 
 
 def pxr(module: str) -> Any:
-    """A module of USD, such as "UsdGeom"."""
-    return optional.load(f"pxr.{module}", PURPOSE, EXTRA)
+    """A module of USD, such as "UsdGeom". Signals wait for its import: USD prints a traceback for one that is ended."""
+    name = f"pxr.{module}"
+    with contextlib.nullcontext() if name in sys.modules else held_signals():
+        return optional.load(name, PURPOSE, EXTRA)
 
 
 class Stage:
