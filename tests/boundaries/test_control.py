@@ -242,11 +242,11 @@ def test_paths_without_a_derivative_are_differenced(path, run, device):
 @pytest.mark.parametrize("pace", [1e-6, 1e-3, 0.05])
 @pytest.mark.parametrize(
     "path",
-    [lambda t: (0.3 * t) % 0.1, lambda t: torch.sin(9 * t), lambda t: 0.3 * t + 1e3, lambda t: (t - 0.2).abs() * t],
-    ids=["jumps", "curved", "far away", "bent"],
+    [lambda t: (0.3 * t) % 0.1, lambda t: torch.sin(9 * t), lambda t: 0.3 * t + 1e3],
+    ids=["jumps", "curved", "far away"],
 )
 def test_a_complete_derivative_is_the_velocity(path, pace, dtype):
-    """For the steps in which the path jumps or bends too."""
+    """For the steps in which the path jumps too."""
     paddle = box(lambda t: torch.stack([path(t), 0.25 + 0 * t]))
     paddle.pace = pace
     times = torch.linspace(0.01, 0.99, 97, dtype=dtype, requires_grad=True)

@@ -216,13 +216,16 @@ class RigidMotion(SceneParameters):
             return rate
         resolution = 4 * torch.finfo(times.dtype).eps * times.abs()
         later = torch.maximum(times + self.pace, times + resolution).clamp(max=self.end)
-        seconds = torch.where(later > times, later - times, 1)
-        seconds = seconds.reshape(*seconds.shape, *(1,) * (centre.dim() - times.dim()))
+        there = later > times
+        seconds, there = (
+            t.reshape(*t.shape, *(1,) * (centre.dim() - times.dim()))
+            for t in (torch.where(there, later - times, 1), there)
+        )
         end = path(later)
         difference = (end - centre) / seconds
         wrong, absent = (difference - rate).detach().abs(), rate == 0
         rounding = 32 * torch.finfo(centre.dtype).eps * centre.detach().abs() / seconds
-        other = ~absent & (wrong > 0.1 * difference.detach().abs() + rounding)
+        other = there & ~absent & (wrong > 0.1 * difference.detach().abs() + rounding)
         if not is_readable(other) or bool(other.any()):
             middle = path(times + 0.5 * (later - times))
             change = 2 * (end - 2 * middle + centre).detach().abs() / seconds  # About `wrong` for a smooth path.
