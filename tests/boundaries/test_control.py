@@ -210,6 +210,9 @@ PATHS = {
     "tensors and a number that moves": lambda t: torch.stack(
         [torch.tensor(0.35 + V * float(t), dtype=F64, device=t.device), 0.25 + 0 * t]
     ),
+    "partly a number": lambda t: torch.stack([0.35 + 0.3 * V * t + 0.7 * V * float(t), 0.25 + 0 * t]),
+    "partly detached": lambda t: torch.stack([0.35 + 0.3 * V * t + 0.7 * V * t.detach(), 0.25 + 0 * t]),
+    "partly against the rest": lambda t: torch.stack([0.35 - V * t + 2 * V * float(t), 0.25 + 0 * t]),
 }
 
 
@@ -233,6 +236,23 @@ def test_paths_without_a_derivative_are_differenced(path, run, device):
             state = mpm.rollout(step, state, n, DT)
         ends.append(state)
     assert_alike(*ends, 1e-8)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+@pytest.mark.parametrize("pace", [1e-6, 1e-3, 0.05])
+@pytest.mark.parametrize(
+    "path",
+    [lambda t: (0.3 * t) % 0.1, lambda t: torch.sin(9 * t), lambda t: 0.3 * t + 1e3],
+    ids=["jumps", "curved", "far away"],
+)
+def test_a_complete_derivative_is_the_velocity(path, pace, dtype):
+    """For the steps in which the path jumps too."""
+    paddle = box(lambda t: torch.stack([path(t), 0.25 + 0 * t]))
+    paddle.pace = pace
+    times = torch.linspace(0.01, 0.99, 97, dtype=dtype, requires_grad=True)
+    (expected,) = torch.autograd.grad(path(times).sum(), times)
+    _, velocity = paddle.path_over(times.detach(), torch.empty(0, 2, dtype=dtype))
+    torch.testing.assert_close(velocity[:, 0, 0], expected)
 
 
 def vector(x: float, y: float) -> Tensor:
