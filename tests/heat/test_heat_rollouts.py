@@ -345,6 +345,22 @@ def test_other_heat_goes_step_by_step(reason):
         assert torch.equal(got.temperature, composed(step, state, 2, DT).temperature)
 
 
+@pytest.mark.parametrize("mixed", [False, True])
+def test_laws_that_read_the_temperature_go_step_by_step(mixed):
+    step, state = scene(2)
+    softens = mpm.NeoHookean(E=mpm.Table([-10.0, 20.0], [2e5, 1e4]), nu=0.3)
+    step.law = mpm.Mixture([mpm.NeoHookean(E=1e4, nu=0.3), softens]) if mixed else softens
+    if mixed:
+        state = state.replace(material=(torch.arange(len(state)) % 2).int())
+    with torch.no_grad():
+        plan = plan_rollout(step, state, 10, DT)
+        assert plan.executor == "loop" and "a parameter of the law is a function" in plan.reasons["fused"]
+        got = mpm.rollout(step, state, 10, DT)
+        assert torch.equal(got.v, composed(step, state, 10, DT).v)
+        alone = mpm.Step(step.grid, step.law, step.gravity)  # the temperature stays
+        assert plan_rollout(alone, state, 10, DT).executor == "fused"
+
+
 @pytest.mark.parametrize("of", ["temperature", "v", "conductivity"])
 def test_gradients_go_step_by_step(of):
     step, state = scene(2)

@@ -63,6 +63,8 @@ def why_not_fused(step: Any, state: State, n: int, dt: float | Tensor) -> str | 
     for part in laws:
         if not isinstance(part, CompiledLaw) or not part.is_all_of_its_update() or type(part).forward is not _FORWARD:
             return f"{type(part).__name__} is more than a compiled law"
+    if step.heat is not None and any([part.has_functions for part in laws]):
+        return "a parameter of the law is a function, and its heat changes the temperature"
     if any([has_hooks(module) for module in (step, *modules_in(law))]):
         return "there are hooks"
     if not all([isinstance(b, Obstacle) and fusible(b, 0.0, paths=True) for b in boundaries.entries]):
