@@ -17,7 +17,7 @@ from torch_mpm.surfaces.files import write_surface
 from .. import common
 
 REPEATS = 3
-"""Number of measurements of a frame, of which the shortest counts: other programs share the machine."""
+"""Number of measurements of a frame. The shortest counts, because other programs share the machine."""
 KINDS: dict[str, dict[str, Any]] = {"points": {}, "grains": {"grains": True}, "surfaces": {"surface": True}}
 
 

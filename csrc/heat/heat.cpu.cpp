@@ -201,7 +201,7 @@ struct HeatSolver {
   }
 
   // Solves the scenes for which a few steps without scalar products suffice.
-  void take_simple_steps() const {
+  void solve_by_simple_steps() const {
     const auto simple = [&](int scene) { return running(scene) && simple_steps(scene) > 0; };
     const auto twice = [&](int scene) { return running(scene) && simple_steps(scene) > 1; };
     bool any = false, again = false;
@@ -284,7 +284,7 @@ template <int Order, class T, int D>
 void heat_cg(const HeatArguments<T, D>& a) {
   const HeatSolver<Order, T, D> solver(a);
   solver.start();
-  solver.take_simple_steps();
+  solver.solve_by_simple_steps();
   while (solver.iterate()) {
   }
   solver.finish();

@@ -74,7 +74,7 @@ class HeatSteps {
   static Field<E> column(const Field<E>& f, int first) {
     return first < 0 ? Field<E>{} : Field<E>{f.pointer + first * f.stride[1], {f.stride[0], f.stride[1], 0}};
   }
-  HeatParticles<T> given() const {
+  HeatParticles<T> columns() const {
     const Field<const T>& f = fields.now();
     return {column(f, 0), column(f, gradient_), column(f, liquid_), column(f, volume_)};
   }
@@ -103,9 +103,9 @@ class HeatSteps {
   std::vector<HeatValue<T>> values_;              // of the parameters; those per particle have no pointer
   std::vector<int> own_;                          // index in `parameters`, or -1
   Tensor conductance_, blend_, number_, changing_;
-  std::vector<double> bounds_;   // of the spectrum of each scene, see HeatArguments
-  Field<const T> temperatures_;  // of the held obstacles [K, B]
-  Tensor given_;                 // exchange of the particles
+  std::vector<double> bounds_;    // of the spectrum of each scene, see HeatArguments
+  Field<const T> temperatures_;   // of the held obstacles [K, B]
+  Tensor exchange_of_particles_;  // with the held surface
   Tensor start_, fixed_, source_, exchange_, surface_;
   size_t power_ = 0;  // its number among the parameters
   int64_t slots_ = -1;
@@ -183,7 +183,7 @@ void HeatSteps<T, D>::check_held() {
   check_shape(in_.heat_boundaries[kHeld], "the held temperatures", {count, in_.scenes});
   check_like(in_.heat_boundaries[kHeld], "the held temperatures", in_.x);
   temperatures_ = field<const T>(in_.heat_boundaries[kHeld]);
-  if (holds_surface()) given_ = empty(in_.x, {particles(), 1});
+  if (holds_surface()) exchange_of_particles_ = empty(in_.x, {particles(), 1});
 }
 
 // The layer of particles near the held surface: the rest of their conductance, and their exchange at the nodes.
@@ -201,13 +201,13 @@ void HeatSteps<T, D>::add_layers(const Field<const T>& x, const Field<const int>
   a.width = kWidth * in_.lattice.dx();
   a.inverse_inertia = in_.lattice.inverse_inertia();
   a.conductance = field<T>(conductance_);
-  a.exchange = column(field<T>(given_), 0);
+  a.exchange = column(field<T>(exchange_of_particles_), 0);
   backend::heat_layers(a, stream);
   T* const exchange = static_cast<T*>(exchange_.data_ptr());
   ScatterArguments<T, D> down;
   down.topology = s_.p2g.topology;
   down.x = x;
-  down.value = field<const T>(given_);
+  down.value = field<const T>(exchange_of_particles_);
   down.nodes = {exchange, 1, 1};
   backend::scatter(in_.lattice.order(), down, stream);
   backend::heat_from_surface(
@@ -277,7 +277,7 @@ HeatToNodesArguments<T, D> HeatSteps<T, D>::to_nodes(const Field<const T>& x, co
   a.x = x;
   a.mass = mass;
   a.velocity_gradient = velocity_gradient;
-  a.particles = given();
+  a.particles = columns();
   a.conductivity = value(0);
   a.specific_heat = value(1);
   a.transfer = HeatTransfer(in_.heat_options[0]);
@@ -349,7 +349,7 @@ void HeatSteps<T, D>::add_terms(const Field<const T>& x, backend::Stream stream)
   HeatSurfaceArguments<T, D> down;
   down.topology = s_.p2g.topology;
   down.x = x;
-  down.volume = given().volume;
+  down.volume = columns().volume;
   if (has_power()) down.power = value(power_);
   down.sums = {sums, kHeatChannels, kHeatChannels};
   backend::heat_surface(in_.lattice.order(), down, stream);

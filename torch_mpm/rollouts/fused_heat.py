@@ -7,7 +7,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..errors import shape_of
 from ..heat.boundaries import (
     STEFAN_BOLTZMANN,
     Convection,
@@ -102,7 +101,7 @@ def _terms(heat: Heat, state: State) -> tuple[list[int], Tensor, Tensor]:
     rows = []
     surfaces = [term for term in terms if type(term) in NUMBERS]
     for term in surfaces:
-        values = [per_scene(name, getattr(term, name), like, scenes) for name in _names(term)]
+        values = [_of_scenes(getattr(term, name), like, scenes) for name in _names(term)]
         if type(term) is Radiation:
             values[0] = STEFAN_BOLTZMANN * values[0]
         rows.append(torch.stack([values[0], values[-1]], 1))
@@ -122,19 +121,13 @@ def _held(step: Step, x: Tensor) -> tuple[list[int], int, Tensor]:
         return [], 0, x.new_empty(0)
     scenes, obstacles = step.grid.scenes, step.boundaries.entries
     numbers = [next(k for k, o in enumerate(obstacles) if o is term.region) for term in terms]
-    rows = [per_scene("temperature", term.temperature, x, scenes) for term in terms]
+    rows = [_of_scenes(term.temperature, x, scenes) for term in terms]
     return numbers, int(type(terms[-1]) is FixedSurface), torch.stack(rows)
 
 
-def per_scene(name: str, value: Any, like: Tensor, scenes: int) -> Tensor:
-    """A value for each scene [B].
-
-    Raises:
-        ValueError: for another shape.
-    """
+def _of_scenes(value: Any, like: Tensor, scenes: int) -> Tensor:
+    """A value for each scene [B], from one of a shape that `_why_not_boundaries` supports."""
     given = torch.as_tensor(value, dtype=like.dtype, device=like.device)
-    if given.shape not in ((), (1,), (scenes,)):
-        raise ValueError(f"{name} must have shape [], [1] or [B] = [{scenes}], got {shape_of(given)}")
     return given.detach().reshape(-1).expand(scenes)
 
 

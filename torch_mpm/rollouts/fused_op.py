@@ -141,7 +141,7 @@ def _arguments(
     law.check_parameters(len(state), grid.scenes)
     calls = law_calls(law, state, dt)
     apic = step.transfer == "apic"
-    wants_C = apic or law.viscous or step.heat is not None
+    wants_C = step._keeps_C or step.heat is not None
     table, *others = obstacle_arguments(boundaries, state.x, grid.scenes, times)
     of_table = table is not None and table.requires_grad
     with_gradient = torch.is_grad_enabled() and (of_table or differentiates(step, state, dt))

@@ -91,7 +91,7 @@ class Stage:
 
 
 def _reason(error: Exception) -> str:
-    """The first of the messages of USD, of which each is a line that ends with a quoted text."""
+    """The first message of USD. A message is a line that ends with a quoted text."""
     found = MESSAGE.search(str(error))
     return f"USD cannot write the file: {found[1]}" if found else "USD cannot write the file"
 

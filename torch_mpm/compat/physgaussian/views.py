@@ -128,7 +128,7 @@ class ParticleView(_View):
 class ModelView(_View):
     """Material and numbers of the simulation, `mpm_model`.
 
-    Parameters are in the units of the dialect: E, nu, yield_stress and others of the dialect [P], of which those in
+    Parameters are in the units of the dialect. E, nu, yield_stress and others of the dialect are [P]. Those in
     `NUMBERS` are numbers unless tensors were given. mu, lam and bulk [P] [Pa] are those of the last `finalize_mu_lam`;
     an assigned one acts from then on, E and nu from the next `finalize_mu_lam`. Tensors may be written to in place, but
     for mu, lam, bulk, and a yield stress that has flowed in units that are not Pa, which have to be assigned.

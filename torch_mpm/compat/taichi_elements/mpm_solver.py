@@ -236,7 +236,7 @@ class MPMSolver:
         sample_density: float | None = None,
         velocity: Sequence[float] | None = None,
     ) -> None:
-        """Particles at random positions in a regular polygon (2-D), a corner of which is at `angle` [rad].
+        """Particles at random positions in a regular polygon (2-D) with a corner at `angle` [rad].
 
         Raises:
             ValueError: in 3-D.
