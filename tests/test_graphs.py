@@ -17,7 +17,8 @@ DT = 2e-4
 def heated(dim: int, device: str, **options) -> tuple[mpm.Step, mpm.State]:
     grid = unit_box(dim)
     plate = mpm.heat_boundaries.Convection(mpm.heat_boundaries.FreeSurface(), coefficient=30.0, ambient=400.0)
-    heat = mpm.Heat(grid, conductivity=5.0, specific_heat=800.0, boundaries=[plate])
+    # The fused op does not call functions, so these steps are replayed.
+    heat = mpm.Heat(grid, lambda theta: torch.full_like(theta, 5.0), specific_heat=800.0, boundaries=[plate])
     step = mpm.Step(grid, mpm.NeoHookean(E=1e4, nu=0.3), gravity=(0.0, -9.8, 0.0)[:dim], walls="slip", heat=heat)
     state = blob(device, dim)
     return step, state.replace(temperature=300 + 40 * state.x[:, 0])
@@ -205,8 +206,9 @@ def test_rollouts_from_graphs_leave_nothing_behind():
         gc.collect()
         by_replays, by_steps = ([size_after(take) for _ in range(6)] for take in (mpm.rollout, one_by_one))
     assert len(step._error_status.all()) == 1
-    # Some tools that watch a GPU keep the tensors of Python calls alive.
-    assert by_replays[-1] - by_replays[0] <= by_steps[-1] - by_steps[0]
+    # An allocation that is left behind takes at least 512 bytes in each of the five later calls. Some tools that watch
+    # a GPU keep the tensors of Python calls alive.
+    assert by_replays[-1] - by_replays[0] < max(5 * 512, by_steps[-1] - by_steps[0] + 1)
     step.check()
 
 

@@ -104,7 +104,8 @@ def test_mixtures(deterministic, transfer, dim, device):
     material = torch.randint(0, 7, (400,), dtype=torch.int32, device=device)
     state = moving(step, blob(device, dim, 400)).replace(material=material, ids=torch.randperm(400).to(device))
     for start in (state, state.sorted(step.grid)):
-        expected, tolerance = gradients(single(), step, start), "rollout with FLIP" if "flip" in transfer else "rollout"
+        expected, loose = gradients(single(), step, start), "flip" in transfer or device == "cuda"
+        tolerance = "rollout with FLIP" if loose else "rollout"
         assert_same(gradients(in_op(2), step, start), expected, tolerance)
         assert_same(gradients(in_op(ALL), step, start), expected, tolerance)
 

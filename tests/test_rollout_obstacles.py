@@ -219,7 +219,8 @@ def test_a_path_is_asked_where_the_obstacle_is(clocks, device):
     expected = one_by_one(step, state, 10, DT)
     times.clear()
     assert_equal(mpm.rollout(step, state, 10, DT).replace(time=0.0), expected.replace(time=0.0))
-    assert len(times) == 3  # once to differentiate it, and once to difference it
+    # Once to differentiate it and once to difference it; on CUDA, where differences are not read, also in their middle.
+    assert len(times) == (3 if device == "cpu" else 4)
 
 
 def test_a_path_has_no_gradient_where_the_obstacle_is_not(device):

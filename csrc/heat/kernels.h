@@ -14,18 +14,17 @@
   PLAIN(heat_patches, PatchArguments)
 MPM_BACKEND_KERNELS(MPM_HEAT_KERNELS)
 
-#if MPM_BACKEND == MPM_BACKEND_IS_cpu
 #define MPM_HEAT_TRANSFER_KERNELS(PLAIN, ORDERED, SIZE) \
   PLAIN(heat_volumes, HeatVolumesArguments)             \
   ORDERED(heat_to_nodes, HeatToNodesArguments)          \
   PLAIN(heat_means, HeatMeansArguments)                 \
   PLAIN(heat_largest, HeatLargestArguments)             \
   ORDERED(heat_surface, HeatSurfaceArguments)           \
-  PLAIN(heat_terms, HeatTermsArguments)                 \
+  PLAIN(heat_add_term, HeatTermArguments)               \
   PLAIN(heat_hold, HeatHoldArguments)                   \
   PLAIN(heat_layers, HeatLayersArguments)               \
   PLAIN(heat_from_surface, HeatFromSurfaceArguments)    \
   PLAIN(heat_increments, HeatIncrementsArguments)       \
+  PLAIN(heat_count, HeatCountArguments)                 \
   ORDERED(heat_to_particles, HeatToParticlesArguments)
 MPM_BACKEND_KERNELS(MPM_HEAT_TRANSFER_KERNELS)
-#endif

@@ -38,6 +38,19 @@ MPM_HD HeatWeights<T> heat_weights(const T& volume, const T& specific_heat, cons
   return w;
 }
 
+// What a particle adds to the channels of a node (HeatChannel), with its temperature; and the slopes of the last two,
+// with the change of temperature over a cell.
+template <class T>
+struct HeatSums {
+  T capacity, varying, theta, mean;
+};
+
+template <class T>
+MPM_HD HeatSums<T> heat_sums(const HeatWeights<T>& w, const T& theta) {
+  const T varying = w.capacity * w.blend;
+  return {w.capacity, varying, w.capacity * theta, varying * theta};
+}
+
 // A quantity after G2P, from the gathered increment and the gathered average θ̄ of the particles.
 template <class T>
 MPM_HD T blended(const T& increment, const T& average, const T& before, const T& blend) {
@@ -53,6 +66,16 @@ MPM_HD Vector<T, D> transported_gradient(const Vector<T, D>& g, const Matrix<T, 
   MPM_UNROLL for (int i = 0; i < D; i++)
     r[i] = g[i] - first[i] + second[i];
   return r;
+}
+
+// The gradient after G2P, from the gathered increment and average.
+template <class T, int D>
+MPM_HD Vector<T, D> gradient_after(const Vector<T, D>& increment, const Vector<T, D>& average,
+                                   const Vector<T, D>& before, const T& blend, const Matrix<T, D>& L, const T& dt) {
+  Vector<T, D> g;
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    g[i] = blended(increment[i], average[i], before[i], blend);
+  return transported_gradient(g, L, dt);
 }
 
 // Layer of width w around a held surface, at a distance a from it: the share s = 1 − (1 − a²/w²)³ of the conductivity,

@@ -4,7 +4,7 @@
 #include <vector>
 
 #include "common/lanes.h"
-#include "heat/particle.h"
+#include "heat/local.h"
 #include "transfer/gather.cpu.h"
 #include "transfer/scatter.cpu.h"
 
@@ -28,21 +28,8 @@ template <class T, int D>
 void heat_volumes(const HeatVolumesArguments<T, D>& a) {
   constexpr int64_t grain = 4096;  // particles below which a range is not split
   parallel_ranges(a.particles, grain, [&](int64_t begin, int64_t end) {
-    for (int64_t p = begin; p < end; p++) {
-      const One<T> particle{p};
-      T volume = at(a.rest, p);
-      if (a.J.pointer)
-        volume = volume * at(a.J, p);
-      else if (a.F.pointer)
-        volume = volume * determinant(load_matrix<D>(particle, a.F));
-      at(a.volume, p) = volume;
-    }
+    for (int64_t p = begin; p < end; p++) heat_volume(a, p);
   });
-}
-
-template <class P>
-MPM_HD P blend_of(HeatTransfer transfer, const P& hybrid) {
-  return transfer == HeatTransfer::hybrid ? hybrid : P(transfer == HeatTransfer::flip ? 0 : 1);
 }
 
 template <int Order, class T, int D>
@@ -65,19 +52,20 @@ void heat_to_nodes(const HeatToNodesArguments<T, D>& a) {
       a.topology, a.x, a.sums, 0, kHeatChannels, [&]<int N>(const GroupOf<N>& g, const Pack<T, N> f[D], int scene) {
         using P = Pack<T, N>;
         const HeatWeights<P> w = weights(g, scene);
-        const P theta = load(a.particles.theta, g), varying = w.capacity * w.blend;
+        const HeatSums<P> sums = heat_sums(w, load(a.particles.theta, g));
         Contribution<P, D> c{};
-        c.value[0] = w.capacity * theta;
-        c.value[1] = varying * theta;
-        c.value[2] = w.capacity;
-        c.value[3] = varying;
+        c.value[kHeatCapacity] = sums.capacity;
+        c.value[kHeatVarying] = sums.varying;
+        c.value[kHeatTheta] = sums.theta;
+        c.value[kHeatMean] = sums.mean;
         MPM_UNROLL for (int d = 0; d < D; d++) {
-          const P slope = a.particles.gradient.pointer ? P(geometry.dx) * load(a.particles.gradient, g, d) : P(0);
-          c.slope[d][0] = w.capacity * slope;
-          c.slope[d][1] = varying * slope;
-          c.slope[d][2] = c.slope[d][3] = P(0);
-          c.value[0] = c.value[0] - c.slope[d][0] * f[d];
-          c.value[1] = c.value[1] - c.slope[d][1] * f[d];
+          const P step = a.particles.gradient.pointer ? P(geometry.dx) * load(a.particles.gradient, g, d) : P(0);
+          const HeatSums<P> slope = heat_sums(w, step);
+          c.slope[d][kHeatCapacity] = c.slope[d][kHeatVarying] = P(0);
+          c.slope[d][kHeatTheta] = slope.theta;
+          c.slope[d][kHeatMean] = slope.mean;
+          c.value[kHeatTheta] = c.value[kHeatTheta] - slope.theta * f[d];
+          c.value[kHeatMean] = c.value[kHeatMean] - slope.mean * f[d];
         }
         return c;
       });
@@ -94,9 +82,9 @@ void heat_surface(const HeatSurfaceArguments<T, D>& a) {
         MPM_UNROLL for (int k = 0; k < kChannels; k++) {
           c.value[k] = P(0);
           MPM_UNROLL for (int d = 0; d < D; d++)
-            c.slope[d][k] = P(0), c.gradient[d][k] = d == k ? slope : P(0);
+            c.slope[d][k] = P(0), c.gradient[d][k] = 1 + d == k ? slope : P(0);
         }
-        if (a.power.pointer) c.value[kHeatChannels - 1] = volume * load(a.power, g, scene);
+        if (a.power.pointer) c.value[0] = volume * load(a.power, g, scene);
         return c;
       });
 }
@@ -123,13 +111,7 @@ template <class T, int D>
 void heat_means(const HeatMeansArguments<T, D>& a) {
   constexpr int64_t grain = 16384;  // nodes below which a range is not split
   parallel_ranges(a.nodes, grain, [&](int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; i++) {
-      T* const sum = a.sums + i * kHeatChannels;
-      const T weight = sum[2], varying = sum[3];
-      a.theta[i] = weight > T(0) ? sum[0] / weight : T(0);
-      a.capacity[i] = weight;
-      sum[1] = varying > T(0) ? sum[1] / varying : T(0);
-    }
+    for (int64_t i = begin; i < end; i++) heat_mean(a, i);
   });
 }
 
@@ -137,8 +119,13 @@ template <class T, int D>
 void heat_increments(const HeatIncrementsArguments<T, D>& a) {
   constexpr int64_t grain = 16384;  // nodes below which a range is not split
   parallel_ranges(a.nodes, grain, [&](int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; i++) a.sums[i * kHeatChannels] = a.increment[i] + (a.start[i] - a.theta[i]);
+    for (int64_t i = begin; i < end; i++) heat_increment(a, i);
   });
+}
+
+template <class T, int D>
+void heat_count(const HeatCountArguments<T, D>& a) {
+  for (int64_t scene = 0; scene < a.scenes; scene++) count_solve(a, scene);
 }
 
 // θ, g and the liquid fraction of a particle or a pack of them, from what it gathered: increment and θ̄.
@@ -149,14 +136,14 @@ void finish_heat(const HeatToParticlesArguments<T, D>& a, const G& g, int scene,
   const P blend = load(a.blend, g), dt(time_step(a.scene_dt, a.dt, scene));
   P theta = blended(gathered[0].value, gathered[1].value, load(a.particles.theta, g), blend);
   if (a.gradient.pointer) {
-    Vector<P, D> after;
+    Vector<P, D> increment, average, before;
     MPM_UNROLL for (int d = 0; d < D; d++)
-      after[d] = blended(scale * gathered[0].moment[d], scale * gathered[1].moment[d], load(a.particles.gradient, g, d),
-                         blend);
+      increment[d] = scale * gathered[0].moment[d], average[d] = scale * gathered[1].moment[d],
+      before[d] = load(a.particles.gradient, g, d);
     const Matrix<P, D> L = load_matrix_or_zero<T, D>(a.velocity_gradient, g);
-    const Vector<P, D> transported = transported_gradient(after, L, dt);
+    const Vector<P, D> after = gradient_after(increment, average, before, blend, L, dt);
     MPM_UNROLL for (int d = 0; d < D; d++)
-      put(transported[d], a.gradient, g, d);
+      put(after[d], a.gradient, g, d);
   }
   if (a.liquid.pointer) {
     P liquid = load(a.particles.liquid, g);
@@ -193,6 +180,7 @@ MPM_INSTANTIATE_ORDERS(heat_to_nodes, HeatToNodesArguments)
 MPM_INSTANTIATE_ORDERS(heat_surface, HeatSurfaceArguments)
 MPM_INSTANTIATE(heat_means, HeatMeansArguments)
 MPM_INSTANTIATE(heat_largest, HeatLargestArguments)
+MPM_INSTANTIATE(heat_count, HeatCountArguments)
 MPM_INSTANTIATE(heat_increments, HeatIncrementsArguments)
 MPM_INSTANTIATE_ORDERS(heat_to_particles, HeatToParticlesArguments)
 

@@ -8,7 +8,11 @@
 // G2P, with the same activation.
 namespace mpm {
 
-constexpr int kHeatChannels = 4;  // of the sums of a node: w θ, w β θ, w, w β with w = N m C
+// Sums of a node with w = N m C: w, w β, w θ and w β θ. The last two become the increment of θ and the average θ̄.
+enum HeatChannel : int { kHeatCapacity, kHeatVarying, kHeatTheta, kHeatMean, kHeatChannels };
+
+// Columns of the status of a scene.
+enum HeatStatus : int { kUnsolved, kLargestResidual, kLargestFront, kHeatStatusSize };
 
 enum class HeatTransfer { hybrid, apic, flip, pic };
 
@@ -44,21 +48,25 @@ struct HeatToNodesArguments {
   HeatTransfer transfer = HeatTransfer::hybrid;
   Field<const T> scene_dt;
   double dt = 0;
+  bool deterministic = false;
   Field<T> conductance, blend, number;  // results per particle
   NodeField<T> sums;                    // kHeatChannels, zero on entry
 };
 
-// Averages of the nodes from their sums: θ, its heat capacity, and θ̄, which replaces w β θ.
+// Averages of the nodes from their sums: θ, its heat capacity, and θ̄, which replaces w β θ. Where nodes may be held,
+// `start` is θ too, and no node is fixed.
 template <class T, int D>
 struct HeatMeansArguments {
   int64_t nodes = 0;
   T* sums = nullptr;
   T* theta = nullptr;
   T* capacity = nullptr;
+  T* start = nullptr;  // may be absent, and `fixed` with it
+  bool* fixed = nullptr;
 };
 
-// Replaces the first channel of the sums by the change of the temperatures: the increments of the solve, from `start`
-// on, which differs from the average `theta` where nodes are held.
+// Replaces w θ in the sums by the change of the temperatures: the increments of the solve, from `start` on, which
+// differs from the average `theta` where nodes are held.
 template <class T, int D>
 struct HeatIncrementsArguments {
   int64_t nodes = 0;
@@ -77,7 +85,7 @@ struct HeatToParticlesArguments {
   HeatTransfer transfer = HeatTransfer::hybrid;
   Field<const T> scene_dt;
   double dt = 0, moment_scale = 1;
-  NodeField<const T> nodes;          // increment and θ̄
+  NodeField<const T> nodes;          // the sums from kHeatTheta on: increment and θ̄
   Field<T> theta, gradient, liquid;  // results, in other memory than the inputs
   Field<T> changing;                 // diffusion number where the liquid fraction changes, else zero; may be absent
 };
@@ -118,29 +126,39 @@ struct HeatFromSurfaceArguments {
   T* source = nullptr;
 };
 
-// Sums for the free surface, |Σ V ∇N| of each node, and for heat from inside the matter.
+// Sums for heat from inside the matter, in the first channel, and for the free surface: Σ V ∇N of each node.
 template <class T, int D>
 struct HeatSurfaceArguments {
   Topology<T, D> topology;
   Field<const T> x, volume;  // present volume
   HeatValue<T> power;        // [W/m³]; without a pointer there is none
-  NodeField<T> sums;         // kHeatChannels, zero on entry: Σ V ∇N, and in the last one the power
+  bool deterministic = false;
+  NodeField<T> sums;  // kHeatChannels, zero on entry
 };
 
-enum class HeatTerm : int64_t { flux, convection, radiation };
+enum class HeatTerm : int64_t { flux, convection, radiation, power };
 
-// Adds the terms of the free surface, and the power, to the exchange and the source of the nodes.
+// Adds a term of the free surface, or the power, to the exchange and the source of the nodes.
 template <class T, int D>
-struct HeatTermsArguments {
+struct HeatTermArguments {
   Topology<T, D> topology;
   const T* sums = nullptr;   // of HeatSurfaceArguments
   const T* theta = nullptr;  // of the nodes
-  int64_t count = 0, scenes = 1;
-  const int64_t* term = nullptr;  // HeatTerm [count]
-  const T* number = nullptr;      // [count, scenes, 2]: flux; or coefficient, or ε σ, and ambient temperature
+  HeatTerm term = HeatTerm::power;
+  const T* number = nullptr;  // [scenes, 2]: flux; or coefficient, or ε σ, and ambient temperature
   double reference = 0;
   T* exchange = nullptr;
   T* source = nullptr;
+};
+
+// Adds the solves of a substep to the status of the scenes.
+template <class T, int D>
+struct HeatCountArguments {
+  int64_t scenes = 0;
+  const bool* converged = nullptr;
+  const T* residual = nullptr;
+  const T* scene_dt = nullptr;  // may be absent
+  double* status = nullptr;     // [scenes, kHeatStatusSize]
 };
 
 // The largest of a value of the particles in each scene, NaN where one is NaN.

@@ -8,24 +8,21 @@
 
 namespace mpm::cuda {
 
-// Entries of the history of a law, side by side, if all of it is there.
+// Entries of the first `variables` history variables of a law, side by side. On the host or in a constant alone: device
+// code does not see the array of variables.
 template <class Law, int D>
-constexpr int history_entries() {
+constexpr int history_entries(int variables) {
   int entries = 0;
-  for (const Quantity& variable : Law::history) entries += variable.matrix ? D * D : 1;
+  for (int k = 0; k < variables; k++) entries += Law::history[k].matrix ? D * D : 1;
   return entries;
 }
 
-// The history variable of an entry.
-template <class Law, int D>
-constexpr int history_variable(int entry) {
-  int variable = 0;
-  for (const Quantity& q : Law::history) {
-    entry -= q.matrix ? D * D : 1;
-    if (entry < 0) break;
-    variable++;
-  }
-  return variable;
+// Entries of the history that the law has with its options, which are its first variables.
+template <class Law, class T, int D>
+int given_history_entries(const LawArguments<T, D>& law) {
+  int given = 0;
+  while (given < kHistory<Law> && law.history[given].pointer) given++;
+  return history_entries<Law, D>(given);
 }
 
 // Momentum of particles whose stress is computed as they are loaded, and stored where it has a destination. Where
@@ -35,11 +32,12 @@ struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true> {
   using Base = MomentumSource<2, T, D, Stress::moment, true>;
   using Kernels = typename Law::template Kernels<Law>;
   static constexpr bool moves_F = Law::field == Deformation::gradient;
-  static constexpr int resident = Law::gpu_p2g_blocks, entries = history_entries<Law, D>();
+  static constexpr int resident = Law::gpu_p2g_blocks, entries = history_entries<Law, D>(kHistory<Law>);
   LawUpdateArguments<T, D> law;
   LateDeformation<T, D> late;
   Columns<const T, moves_F ? D * D : 1> state;  // F or J, as given
   Columns<T, moves_F ? D * D : 1> kept;         // and their destination; optional
+  int kept_entries;                             // of the history
 
   // Result of the law at a particle.
   struct Changes {
@@ -52,7 +50,12 @@ struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true> {
 
   LawMomentumSource(const P2GArguments<T, D>& a, const LawUpdateArguments<T, D>& law,
                     const LateDeformation<T, D>& late = {})
-      : Base(a), law(law), late(late), state(law.law.state, D), kept(Law::plastic ? law.state : late.state, D) {}
+      : Base(a),
+        law(law),
+        late(late),
+        state(law.law.state, D),
+        kept(Law::plastic ? law.state : late.state, D),
+        kept_entries(law.history.pointer ? given_history_entries<Law>(law.law) : 0) {}
 
   // Inputs of the law at a particle, except its history.
   __device__ void fetch(int p, Changes& changes) const {
@@ -102,12 +105,9 @@ struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true> {
 #pragma unroll
       for (int k = 0; moves_F && k < D * D; k++) kept.at(p, k) = changes.F[k / D][k % D];
     }
-    if (!law.history.pointer) return;
 #pragma unroll
-    for (int k = 0; k < entries; k++) {  // options decide how much of its history a law has: the first variables
-      if (law.law.history[history_variable<Law, D>(k)].pointer)
-        store_entry(One<T>{p}, law.history, k, changes.history[k]);
-    }
+    for (int k = 0; k < entries; k++)
+      if (k < kept_entries) store_entry(One<T>{p}, law.history, k, changes.history[k]);
   }
   __device__ Matrix<T, D> update(int p, const Matrix<T, D>& C, const T& dt) const {
     if constexpr (MayMove) {

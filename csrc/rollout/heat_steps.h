@@ -4,16 +4,12 @@
 #include <optional>
 
 #include "heat/kernels.h"
-#include "rollout/own_field.cpu.h"
+#include "rollout/own_field.h"
 #include "rollout/step_kernels.h"
 
-// Conduction of heat in the substeps of a call on the CPU, in the order of torch_mpm/heat/heat.py: present volumes
-// before the laws; after G2P, with the positions before it: sums on the nodes, the solve, and the temperature of the
-// particles.
+// Conduction of heat in the substeps of a call, in the order of torch_mpm/heat/heat.py: present volumes before the
+// laws; after G2P, with the positions before it: sums on the nodes, the solve, and the temperature of the particles.
 namespace mpm {
-
-// Columns of the status of a scene.
-enum HeatStatus : int { kUnsolved = 0, kLargestResidual = 1, kLargestFront = 2, kHeatStatusSize = 3 };
 
 template <class T, int D>
 class HeatSteps {
@@ -40,10 +36,10 @@ class HeatSteps {
   // Computes the temperatures after a substep, with positions before it and the velocity gradient after it.
   void run(const Field<const T>& x, const Field<const T>& mass, const Field<const T>& velocity_gradient,
            const Field<const int>& scene, backend::Stream stream) {
-    make_nodes();
+    make_nodes(stream);
     HeatToNodesArguments<T, D> down = to_nodes(x, mass, velocity_gradient);
     backend::heat_to_nodes(in_.lattice.order(), down, stream);
-    if (exchanges()) clear(exchange_), clear(source_);
+    if (exchanges()) backend::clear(exchange_, stream), backend::clear(source_, stream);
     if (holds_surface()) add_layers(x, scene, stream);
     means(stream);
     if (has_terms()) add_terms(x, stream);
@@ -88,7 +84,7 @@ class HeatSteps {
   void hold_nodes(HeatArguments<T, D>& a, backend::Stream stream);
   void read_parameter(const Tensor& t, const char* name);
   HeatValue<T> value(size_t k) const;
-  void make_nodes();
+  void make_nodes(backend::Stream stream);
   HeatToNodesArguments<T, D> to_nodes(const Field<const T>& x, const Field<const T>& mass,
                                       const Field<const T>& velocity_gradient) const;
   HeatToParticlesArguments<T, D> to_particles(const HeatToNodesArguments<T, D>& down);
@@ -103,7 +99,7 @@ class HeatSteps {
   std::vector<HeatValue<T>> values_;              // of the parameters; those per particle have no pointer
   std::vector<int> own_;                          // index in `parameters`, or -1
   Tensor conductance_, blend_, number_, changing_;
-  std::vector<double> bounds_;    // of the spectrum of each scene, see HeatArguments
+  std::vector<double> bounds_;    // of the spectrum of each scene on the CPU, see HeatArguments
   Field<const T> temperatures_;   // of the held obstacles [K, B]
   Tensor exchange_of_particles_;  // with the held surface
   Tensor start_, fixed_, source_, exchange_, surface_;
@@ -216,11 +212,9 @@ void HeatSteps<T, D>::add_layers(const Field<const T>& x, const Field<const int>
       stream);
 }
 
-// Sets the temperatures at the start of the solve, and which nodes stay at them.
+// Sets which nodes stay at which temperatures.
 template <class T, int D>
 void HeatSteps<T, D>::hold_nodes(HeatArguments<T, D>& a, backend::Stream stream) {
-  torch::stable::copy_(start_, theta_);
-  clear(fixed_);
   T* const start = static_cast<T*>(start_.data_ptr());
   bool* const fixed = static_cast<bool*>(fixed_.data_ptr());
   for (int64_t k = 0; k < held_nodes(); k++)
@@ -253,7 +247,7 @@ HeatValue<T> HeatSteps<T, D>::value(size_t k) const {
 
 // Makes the node tensors for the size of the pool.
 template <class T, int D>
-void HeatSteps<T, D>::make_nodes() {
+void HeatSteps<T, D>::make_nodes(backend::Stream stream) {
   const int64_t slots = s_.activation.slots(), nodes = slots * kBlockNodes<D>;
   if (slots != slots_) {
     slots_ = slots;
@@ -266,7 +260,7 @@ void HeatSteps<T, D>::make_nodes() {
     if (has_terms()) surface_ = empty(in_.x, {nodes, kHeatChannels});
     workspace_ = Tensor();
   }
-  clear(sums_);
+  backend::clear(sums_, stream);
 }
 
 template <class T, int D>
@@ -283,6 +277,7 @@ HeatToNodesArguments<T, D> HeatSteps<T, D>::to_nodes(const Field<const T>& x, co
   a.transfer = HeatTransfer(in_.heat_options[0]);
   a.scene_dt = s_.p2g.scene_dt;
   a.dt = in_.dt;
+  a.deterministic = in_.lattice.deterministic();
   a.conductance = field<T>(conductance_);
   a.blend = field<T>(blend_);
   a.number = field<T>(number_);
@@ -305,7 +300,7 @@ HeatToParticlesArguments<T, D> HeatSteps<T, D>::to_particles(const HeatToNodesAr
   a.scene_dt = down.scene_dt;
   a.dt = down.dt;
   a.moment_scale = in_.lattice.inverse_inertia();
-  a.nodes = {down.sums.pointer, kHeatChannels, 2};
+  a.nodes = {down.sums.pointer + kHeatTheta, kHeatChannels, kHeatChannels - kHeatTheta};
   const Field<T> next = fields.next(true);
   a.theta = column(next, 0);
   a.gradient = column(next, gradient_);
@@ -323,10 +318,13 @@ void HeatSteps<T, D>::find_largest(const Field<const T>& of, const Field<const i
 
 template <class T, int D>
 void HeatSteps<T, D>::means(backend::Stream stream) {
-  backend::heat_means(
-      HeatMeansArguments<T, D>{slots_ * kBlockNodes<D>, static_cast<T*>(sums_.data_ptr()),
-                               static_cast<T*>(theta_.data_ptr()), static_cast<T*>(capacity_.data_ptr())},
-      stream);
+  HeatMeansArguments<T, D> a{slots_ * kBlockNodes<D>, static_cast<T*>(sums_.data_ptr()),
+                             static_cast<T*>(theta_.data_ptr()), static_cast<T*>(capacity_.data_ptr())};
+  if (held_nodes() > 0) {
+    a.start = static_cast<T*>(start_.data_ptr());
+    a.fixed = static_cast<bool*>(fixed_.data_ptr());
+  }
+  backend::heat_means(a, stream);
 }
 
 template <class T, int D>
@@ -344,27 +342,30 @@ void HeatSteps<T, D>::check_terms() {
 // The terms of the free surface, and the heat from inside the matter.
 template <class T, int D>
 void HeatSteps<T, D>::add_terms(const Field<const T>& x, backend::Stream stream) {
-  clear(surface_);
+  backend::clear(surface_, stream);
   T* const sums = static_cast<T*>(surface_.data_ptr());
   HeatSurfaceArguments<T, D> down;
   down.topology = s_.p2g.topology;
   down.x = x;
   down.volume = columns().volume;
   if (has_power()) down.power = value(power_);
+  down.deterministic = in_.lattice.deterministic();
   down.sums = {sums, kHeatChannels, kHeatChannels};
   backend::heat_surface(in_.lattice.order(), down, stream);
-  HeatTermsArguments<T, D> a;
+  HeatTermArguments<T, D> a;
   a.topology = s_.p2g.topology;
   a.sums = sums;
   a.theta = field<const T>(theta_).pointer;
-  a.count = int64_t(in_.heat_terms.size());
-  a.scenes = in_.scenes;
-  a.term = in_.heat_terms.data();
-  if (a.count > 0) a.number = static_cast<const T*>(in_.heat_boundaries[kNumbers].data_ptr());
   a.reference = in_.heat_scalars[1];
   a.exchange = static_cast<T*>(exchange_.data_ptr());
   a.source = static_cast<T*>(source_.data_ptr());
-  backend::heat_terms(a, stream);
+  for (size_t k = 0; k < in_.heat_terms.size(); k++) {
+    a.term = HeatTerm(in_.heat_terms[k]);
+    a.number = static_cast<const T*>(in_.heat_boundaries[kNumbers].data_ptr()) + 2 * int64_t(k) * in_.scenes;
+    backend::heat_add_term(a, stream);
+  }
+  a.term = HeatTerm::power;
+  if (has_power()) backend::heat_add_term(a, stream);
 }
 
 template <class T, int D>
@@ -384,11 +385,13 @@ void HeatSteps<T, D>::solve(const Field<const T>& x, const Field<const int>& sce
   a.tolerance = kNegligibleResidual;
   a.relative_tolerance = in_.heat_scalars[0];
   a.most = int(in_.heat_options[1]);
-  // With W = M/dt, u · H u ≤ Σ K_i u_i² and K_i = D⁻¹ Σ_p κ_p V_p N_i ≤ D⁻¹ dx² max_p r_p W_i (csrc/heat/cell.h).
-  std::fill(bounds_.begin(), bounds_.end(), 0.0);
-  find_largest(field<const T>(number_), scene, bounds_.data(), 1, stream);
-  for (double& bound : bounds_) bound *= in_.lattice.inverse_inertia() * in_.lattice.dx() * in_.lattice.dx();
-  a.scene_bound = bounds_.data();
+  if (MPM_BACKEND == MPM_BACKEND_IS_cpu) {
+    // With W = M/dt, u · H u ≤ Σ K_i u_i² and K_i = D⁻¹ Σ_p κ_p V_p N_i ≤ D⁻¹ dx² max_p r_p W_i (csrc/heat/cell.h).
+    std::fill(bounds_.begin(), bounds_.end(), 0.0);
+    find_largest(field<const T>(number_), scene, bounds_.data(), 1, stream);
+    for (double& bound : bounds_) bound *= in_.lattice.inverse_inertia() * in_.lattice.dx() * in_.lattice.dx();
+    a.scene_bound = bounds_.data();
+  }
   a.deterministic = in_.lattice.deterministic();
   if (held_nodes() > 0) hold_nodes(a, stream);
   if (exchanges()) a.exchange = field<const T>(exchange_).pointer, a.source = field<const T>(source_).pointer;
@@ -406,15 +409,10 @@ void HeatSteps<T, D>::solve(const Field<const T>& x, const Field<const int>& sce
 template <class T, int D>
 void HeatSteps<T, D>::count(const Field<const int>& scene, backend::Stream stream) {
   double* const rows = static_cast<double*>(status.data_ptr());
-  const T* const residual = static_cast<const T*>(residual_.data_ptr());
-  const bool* const converged = static_cast<const bool*>(converged_.data_ptr());
-  const T* const scene_dt = s_.p2g.scene_dt.pointer;
-  for (int64_t b = 0; b < in_.scenes; b++) {
-    if (converged[b] || (scene_dt && scene_dt[b] == T(0))) continue;  // a paused scene has nothing to solve
-    double* const row = rows + b * kHeatStatusSize;
-    row[kUnsolved] += 1;
-    if (!(double(residual[b]) <= row[kLargestResidual])) row[kLargestResidual] = double(residual[b]);  // NaN stays
-  }
+  backend::heat_count(
+      HeatCountArguments<T, D>{in_.scenes, static_cast<const bool*>(converged_.data_ptr()),
+                               static_cast<const T*>(residual_.data_ptr()), s_.p2g.scene_dt.pointer, rows},
+      stream);
   if (melts()) find_largest(field<const T>(changing_), scene, rows + kLargestFront, kHeatStatusSize, stream);
 }
 

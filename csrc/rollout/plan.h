@@ -297,7 +297,7 @@ inline PlannedPool pool_for(const PlanFacts& f) {
   if (f.gradients) return {-1, kGrowingSteps};
   const int64_t room = f.particles >= kLeastFusedParticles ? f.particles / kParticlesPerBlock : 0;
   if (room >= f.blocks() || takes_few_blocks(f)) return {f.blocks(), kWholeSteps};
-  const bool passes = f.deterministic || f.mirrors || f.flips;
+  const bool passes = f.deterministic || f.mirrors || f.flips || f.heat;
   const int64_t times = f.max_blocks < 0 || passes ? 0 : room / std::max<int64_t>(kRoomy * f.max_blocks, 1);
   if (times > 0) return {room, kRoomySteps * std::min<int64_t>(times, 2)};
   return {-1, kGrowingSteps};

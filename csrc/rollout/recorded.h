@@ -293,6 +293,7 @@ bool Recorded<T, D>::run() {
     steps.write({x[i], v[i], C[i], F[i], J[i], residual[i], history[i]});
     if (has(in_.material)) keep_others(i);
     steps.move(stream_);
+    steps.end_time(stream_);
     after_substeps(in_.x.size(0), 1, stream_);
   }
   return taken_ = true;

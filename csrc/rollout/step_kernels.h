@@ -233,11 +233,11 @@ struct Substeps {
 #endif
   }
 
+  // Moves the particles; the time of the obstacles stays that of the step.
   void move(backend::Stream stream) {
     if (flips()) keep_velocities(p2g, field<T>(kept), stream);
     for (size_t k = 0; k < laws.size() && !fused; k++) calls[k].law->kernels<T, D>().update(laws[k], stream);
     move_grid(stream);
-    end_time(stream);
     backend::g2p_advance(in.lattice.order(), advance, stream);
     if (flips()) add_flip(field<const T>(kept), stream);
   }

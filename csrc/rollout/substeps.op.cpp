@@ -131,8 +131,7 @@ Results run_steps(const SubstepsInputs& in, backend::Stream stream) {
 Results run(const SubstepsInputs& in) {
   const Tensor& x = in.x;
   check_positions(x);
-  STD_TORCH_CHECK(in.heat.empty() || (x.is_cpu() && !in.records && in.resident),
-                  "heat is computed on the CPU, without gradients");
+  STD_TORCH_CHECK(in.heat.empty() || (!in.records && in.resident), "heat is computed without gradients");
   const DeviceScope device(x);
   if (in.records && !has(in.impulse) && x.size(0) > 0) {
     std::optional<Results> recorded;

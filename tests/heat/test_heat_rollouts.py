@@ -18,11 +18,12 @@ LAWS = ("neo_hookean", "fluid", "von_mises", "sand", "viscoelastic")
 TRANSFERS = ("hybrid", "apic", "flip", "pic")
 
 
-def scene(dim=3, dtype=torch.float64, scenes=1, law="neo_hookean", **options):
+def scene(dim=3, dtype=torch.float64, scenes=1, law="neo_hookean", device="cpu", **options):
     """A step and a state: a block in motion whose temperature varies, in an order that is not that of cells."""
     g = torch.Generator().manual_seed(5)
     melts, per_particle = options.pop("melts", False), options.pop("per_particle", False)
-    grid = mpm.Grid(0.1, (0.0,) * dim, (1.0,) * dim, scenes, options.pop("kernel", "quadratic"))
+    of_grid = {"kernel": options.pop("kernel", "quadratic"), "deterministic": options.pop("deterministic", False)}
+    grid = mpm.Grid(0.1, (0.0,) * dim, (1.0,) * dim, scenes, **of_grid)
     points = mpm.seed.box((0.25,) * dim, (0.65,) * dim, grid, 2**dim, dtype=dtype)
     x = points.x[torch.randperm(len(points.x), generator=g)].repeat(scenes, 1)
     count = len(x)
@@ -49,7 +50,7 @@ def scene(dim=3, dtype=torch.float64, scenes=1, law="neo_hookean", **options):
         grid, mpm.Mixture([each() for each in laws]) if law == "mixture" else laws[0](), (0.0, -10.0, 0.0)[:dim],
         "separate", boundaries=[mpm.Sphere((0.51, 0.22, 0.48)[:dim], 0.1, friction=0.2)], heat=heat, **options,
     )  # fmt: skip
-    return step, step.prepare(state)
+    return step.to(device), step.prepare(state.to(device=device))
 
 
 def composed(step, state, n, dt):
@@ -60,6 +61,7 @@ def composed(step, state, n, dt):
 
 def compare(step, state, n=12, dt=DT, schedule=None, tolerance=1e-9):
     """Fields after n steps of the op are those of single steps; returns the former."""
+    step, dt = step.to(state.x.device), dt.to(state.x.device) if isinstance(dt, torch.Tensor) else dt
     with torch.no_grad():
         assert plan_rollout(step, state, n, dt, schedule=schedule).executor == "fused"
         got, expected = mpm.rollout(step, state, n, dt, schedule=schedule), composed(step, state, n, dt)
@@ -80,18 +82,18 @@ def compare(step, state, n=12, dt=DT, schedule=None, tolerance=1e-9):
 
 @pytest.mark.parametrize("melts", [False, True])
 @pytest.mark.parametrize("transfer", TRANSFERS)
-def test_transfers(dim, transfer, melts):
-    compare(*scene(dim, transfer=transfer, melts=melts))
+def test_transfers(dim, transfer, melts, device):
+    compare(*scene(dim, transfer=transfer, melts=melts, device=device))
 
 
 @pytest.mark.parametrize("law", [*LAWS, "mixture"])
-def test_laws(dim, law):
-    compare(*scene(dim, law=law))
+def test_laws(dim, law, device):
+    compare(*scene(dim, law=law, device=device))
 
 
-def test_parameters_of_materials(dim):
+def test_parameters_of_materials(dim, device):
     """Numbers for each material, as in scene files; one of the materials does not melt."""
-    step, state = scene(dim, law="mixture", melts=True)
+    step, state = scene(dim, law="mixture", melts=True, device=device)
     numbers = {"conductivity": 500.0, "specific_heat": 80.0, "melting_point": 1.0, "latent_heat": 300.0}
     for name, number in numbers.items():
         values = [number * (1 + k) for k in range(len(LAWS))]
@@ -107,7 +109,7 @@ def test_parameters_of_materials(dim):
 
 
 @pytest.mark.parametrize("seed", range(24))
-def test_random_combinations(seed):
+def test_random_combinations(seed, device):
     """Laws x transfers x kernels x batches x parameters x time steps x schedules, in both dtypes."""
     r = random.Random(seed)
     scenes, dtype = r.choice((1, 3)), r.choice((torch.float32, torch.float64))
@@ -115,23 +117,39 @@ def test_random_combinations(seed):
     step, state = scene(
         r.choice((2, 3)), dtype, scenes, r.choice((*LAWS, "mixture")), melts=r.random() < 0.5,
         per_particle=r.random() < 0.5, kernel=r.choice(("quadratic", "cubic")), transfer=r.choice(TRANSFERS),
-        flip=flip, compensated=r.choice((True, False)),
+        flip=flip, compensated=r.choice((True, False)), device=device,
+        deterministic=r.choice((True, False)),
     )  # fmt: skip
     dt = torch.linspace(1, 2, scenes, dtype=dtype) * DT if r.random() < 0.5 else DT
-    schedule = r.choice((None, "per_step", "sorted_cpu"))
+    schedule = r.choice((None, "per_step", "sorted_cpu" if device == "cpu" else None))
     compare(step, state, r.choice((2, 9, 25)), dt, schedule, 1e-8 if dtype == torch.float64 else 2e-3)
 
 
-def test_long_rollouts_keep_the_order_and_the_heat():
-    step, state = scene(3, melts=True)
+def test_long_rollouts_keep_the_order_and_the_heat(device):
+    step, state = scene(3, melts=True, device=device)
     end = compare(step, state, 60)
     before, after = (step.heat.heat_content(s).sum() for s in (state, end))
     assert abs(float(after / before) - 1) < 1e-12
 
 
-def test_stiff_conduction_agrees():
+def test_deterministic_grids_repeat_the_heat(dim, device):
+    """To the last bit, also where a CUDA graph repeats the steps."""
+    ends = []
+    for _ in range(2):
+        step, state = scene(dim, torch.float32, melts=True, deterministic=True, device=device)
+        region, plate = bodies(dim)["sphere"], bodies(dim)["plane"]
+        step = held(step, (heat_boundaries.FixedSurface, region, 40.0), (heat_boundaries.Fixed, plate, -5.0))
+        step.heat.boundaries = [*step.heat.boundaries.entries, *terms()["convection"]]
+        with torch.no_grad():
+            ends.append(mpm.rollout(step, state, 40, DT))
+    for name in ("x", "v", "temperature"):
+        assert torch.equal(getattr(ends[0], name), getattr(ends[1], name)), name
+    assert all(torch.equal(value, ends[1].extra[name]) for name, value in ends[0].extra.items())
+
+
+def test_stiff_conduction_agrees(device):
     """Diffusion numbers far above one take many iterations."""
-    step, state = scene(2)
+    step, state = scene(2, device=device)
     step.heat.conductivity = 2e7
     compare(step, state, 5, tolerance=1e-6)
 
@@ -162,11 +180,11 @@ def held(step, *terms):
 
 @pytest.mark.parametrize("kind", [heat_boundaries.Fixed, heat_boundaries.FixedSurface])
 @pytest.mark.parametrize("shape", bodies(2))
-def test_held_obstacles(dim, shape, kind):
-    step, state = scene(dim, melts=True)
+def test_held_obstacles(dim, shape, kind, device):
+    step, state = scene(dim, melts=True, device=device)
     region = bodies(dim)[shape]
     end = compare(held(step, (kind, region, 40.0)), state, 10)
-    alone, start = scene(dim, melts=True)
+    alone, start = scene(dim, melts=True, device=device)
     alone.boundaries = step.boundaries
     with torch.no_grad():
         without = mpm.rollout(alone, start, 10, DT)
@@ -174,9 +192,9 @@ def test_held_obstacles(dim, shape, kind):
 
 
 @pytest.mark.parametrize("dt", [DT, torch.tensor([1.0, 2.0, 0.5], dtype=torch.float64) * DT])
-def test_held_obstacles_of_scenes(dt):
+def test_held_obstacles_of_scenes(dt, device):
     """Obstacles of single scenes and of all, nodes and a surface, temperatures for each scene."""
-    step, state = scene(2, scenes=3)
+    step, state = scene(2, scenes=3, device=device)
     own = mpm.Sphere((0.4, 0.3), 0.1, scene=1)
     every = mpm.Box(torch.tensor([[0.3, 0.3], [0.6, 0.3], [0.45, 0.6]]), (0.2, 0.1), velocity=(1.0, 0.5))
     floor = mpm.Plane((0.0, 0.27), (0.0, 1.0))
@@ -202,9 +220,9 @@ def terms(scenes=1, particles=0):
 
 @pytest.mark.parametrize("with_held", [False, True])
 @pytest.mark.parametrize("name", [*terms(), "all"])
-def test_free_surface_and_sources(dim, name, with_held):
+def test_free_surface_and_sources(dim, name, with_held, device):
     """Terms of boundaries, alone, together and beside obstacles that hold a temperature."""
-    step, state = scene(dim, melts=True)
+    step, state = scene(dim, melts=True, device=device)
     step.heat.reference = 290.0
     chosen = [t for own in terms().values() for t in own] if name == "all" else terms()[name]
     step.heat.boundaries = chosen
@@ -219,16 +237,16 @@ def test_free_surface_and_sources(dim, name, with_held):
 
 
 @pytest.mark.parametrize("per_particle", [False, True])
-def test_free_surface_and_sources_of_scenes(per_particle):
-    step, state = scene(2, scenes=3)
+def test_free_surface_and_sources_of_scenes(per_particle, device):
+    step, state = scene(2, scenes=3, device=device)
     step.heat.reference = 290.0
     step.heat.boundaries = [term for own in terms(3, len(state) if per_particle else 0).values() for term in own]
     compare(step, state, 6, torch.tensor([1.0, 2.0, 0.5], dtype=torch.float64) * DT)
 
 
-def test_heat_of_a_source_is_its_energy():
+def test_heat_of_a_source_is_its_energy(device):
     """Without another boundary the content grows by power times volume times time."""
-    step, state = scene(3)
+    step, state = scene(3, device=device)
     step.heat.boundaries = [heat_boundaries.Source(2e8)]
     with torch.no_grad():
         end = mpm.rollout(step, state, 1, DT)
@@ -237,15 +255,17 @@ def test_heat_of_a_source_is_its_energy():
 
 
 @pytest.mark.parametrize("bounds", [[4e-7], [8e-4], [2e-2], [4e-7, 8e-4, 2e-2], [8e-4, 2e-2, 4e-7]])
-def test_short_solves_reach_the_tolerance(dim, bounds):
+def test_short_solves_reach_the_tolerance(dim, bounds, device):
     """Changes of temperature at bounds of the spectrum that need one, two or more steps of the solver, against solves
     with a tolerance near rounding; scenes of a batch need different numbers."""
     changes = []
     for run, tolerance in ((mpm.rollout, 1e-6), (composed, 1e-13)):
-        step, state = scene(dim, scenes=len(bounds), transfer="flip")  # hybrid and APIC change more than conduction
+        # The hybrid and APIC change more than conduction.
+        step, state = scene(dim, scenes=len(bounds), transfer="flip", device=device)
         conductivity = torch.tensor(bounds, dtype=torch.float64) * 1000 * 100 * 0.1**2 / (4 * DT)
         step.heat.specific_heat, step.heat.tolerance = torch.tensor(100.0, dtype=torch.float64), tolerance
         step.heat.conductivity = conductivity if len(bounds) > 1 else float(conductivity)
+        step.to(device)
         with torch.no_grad():
             changes.append(run(step, state, 4, DT).temperature - state.temperature)
     for b, bound in enumerate(bounds):
@@ -254,8 +274,8 @@ def test_short_solves_reach_the_tolerance(dim, bounds):
         assert relative_error(changes[0][rows], changes[1][rows]) < 2e-6
 
 
-def test_paused_scenes():
-    step, state = scene(2, scenes=3)
+def test_paused_scenes(device):
+    step, state = scene(2, scenes=3, device=device)
     dt = torch.tensor([DT, 0.0, 2 * DT], dtype=torch.float64)
     end = compare(step, state, 6, dt)
     rows = state.scene == 1
@@ -263,8 +283,8 @@ def test_paused_scenes():
     step.check(end)
 
 
-def test_rollout_to_and_frames():
-    step, state = scene(2)
+def test_rollout_to_and_frames(device):
+    step, state = scene(2, device=device)
     with torch.no_grad():
         result = mpm.rollout_to(step, state, 5e-3)
         assert float(result.state.time) == pytest.approx(5e-3)
@@ -274,10 +294,10 @@ def test_rollout_to_and_frames():
     torch.testing.assert_close(frames.end.temperature, later[-1])
 
 
-def test_unsolved_heat_is_reported():
+def test_unsolved_heat_is_reported(device):
     messages = []
     for run in (mpm.rollout, composed):
-        step, state = scene(2)
+        step, state = scene(2, device=device)
         step.heat.max_iterations, step.heat.conductivity = 1, 2e6
         with torch.no_grad():
             run(step, state, 3, DT)
@@ -287,10 +307,10 @@ def test_unsolved_heat_is_reported():
     assert messages[0] == messages[1] and "heat" in messages[0]
 
 
-def test_lagging_fronts_are_reported():
+def test_lagging_fronts_are_reported(device):
     numbers = []
     for run in (mpm.rollout, composed):
-        step, state = scene(2, melts=True, scenes=2)
+        step, state = scene(2, melts=True, scenes=2, device=device)
         step.heat.conductivity = torch.tensor(2e7, dtype=torch.float64)
         with torch.no_grad(), warnings.catch_warnings():
             warnings.simplefilter("error")
@@ -442,9 +462,9 @@ def test_gradients_of_paths_go_step_by_step(kind):
 
 
 @pytest.mark.parametrize("transfer", TRANSFERS)
-def test_absent_particles_and_those_outside_keep_their_heat(dim, transfer):
+def test_absent_particles_and_those_outside_keep_their_heat(dim, transfer, device):
     """Particles of no scene, and of a scene that moves out of the grid."""
-    step, state = scene(dim, transfer=transfer, melts=True, scenes=2)
+    step, state = scene(dim, transfer=transfer, melts=True, scenes=2, device=device)
     step.walls = None
     absent = torch.arange(len(state)) % 3 == 0
     outside = torch.tensor([500.0, *[0.0] * (dim - 1)], dtype=torch.float64)
@@ -464,9 +484,9 @@ def test_absent_particles_and_those_outside_keep_their_heat(dim, transfer):
 
 
 @pytest.mark.parametrize("melts", [False, True])
-def test_parameters_of_particles_in_another_order(dim, melts):
+def test_parameters_of_particles_in_another_order(dim, melts, device):
     """Values of particles belong to their ids."""
-    step, state = scene(dim, melts=melts, per_particle=True)
+    step, state = scene(dim, melts=melts, per_particle=True, device=device)
     step.heat.boundaries = [heat_boundaries.Source(1e8 * (1 + state.x[:, 0]))]
     order = torch.randperm(len(state), generator=torch.Generator().manual_seed(3))
     permuted = state.select(order).replace(ids=order)

@@ -24,7 +24,7 @@ scene; sums, also those of gradients, may then round differently. With `records`
 `record`, opaque bytes, and no step is recomputed, except where impulses are counted or the pool had to grow. `residual`
 is `State.x_residual`; without it positions are not compensated.
 
-Heat is conducted where `heat` is not empty, on the CPU and without gradients: temperature [P], conductivity and
+Heat is conducted where `heat` is not empty, without gradients: temperature [P], conductivity and
 specific heat; for materials that melt also liquid fraction [P], melting point and latent heat; and last, for the first
 two numbers in `TRANSFERS` of torch_mpm.heat, the temperature gradient [P, D]. Parameters are [], [1], [B] or [P].
 `heat_options` are the number of the transfer, the maximum number of iterations, and whether the last of the

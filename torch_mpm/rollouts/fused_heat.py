@@ -30,8 +30,6 @@ def why_not_fused_heat(step: Step, state: State, n: int, dt: float | Tensor) -> 
     """Reason why the fused op does not conduct the heat of n steps; None if it does."""
     heat = step.heat
     assert heat is not None
-    if state.x.is_cuda:
-        return "it conducts heat on a CUDA device"
     if type(heat) is not Heat:
         return f"{type(heat).__name__} may do more than a Heat"
     if heat.grid is not step.grid:

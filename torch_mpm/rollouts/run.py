@@ -70,8 +70,8 @@ def rollout(
             rollout makes it.
 
     A `Step` of compiled laws without user functions computes all steps in one op, or in a few calls of it. With
-    heat it does so on the CPU without gradients, if the boundaries of the heat are held obstacles of the step,
-    sources, or terms of the free surface with constant numbers. `Step.explain` returns the executor, the schedule
+    heat it does so without gradients, if the boundaries of the heat are held obstacles of the step, sources, or terms
+    of the free surface with constant numbers. `Step.explain` returns the executor, the schedule
     and the reasons. The results are those of single steps. On CUDA they are bitwise equal, with two exceptions,
     which round differently, as all steps on a CPU do:
 

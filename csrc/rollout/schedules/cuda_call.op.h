@@ -2,6 +2,7 @@
 
 #include "common/signals.h"
 #include "cuda/graph.h"
+#include "rollout/heat_steps.h"
 #include "rollout/schedules/block_per_scene.op.h"
 #include "rollout/schedules/fused_g2p2g.op.h"
 #include "rollout/schedules/persistent.op.h"
@@ -31,6 +32,7 @@ class CudaCall {
     s_.facts.captured = is_captured(stream_);
     s_.facts.graph_loops = !loops_are_refused;
     schedule_ = schedule_of(in_.schedule, s_.facts);
+    if (HeatSteps<T, D>::wanted(in_)) heat_.emplace(s_);
   }
 
   // The schedule of the call; after run(), that of its last substeps.
@@ -38,7 +40,7 @@ class CudaCall {
 
   void run() {
     if (schedule_ == kBlockPerScene) return run_block_per_scene();
-    if (in_.n > 1) s_.let_activations_last(stream_);
+    if (in_.n > 1 && !heat_) s_.let_activations_last(stream_);  // heat needs the base blocks of all particles
     s_.fuse(false);
     s_.make_pool(stream_);
     s_.count_time(before_, stream_);
@@ -49,8 +51,9 @@ class CudaCall {
   }
 
   Results results() const {
-    return {x_[last_], v_,    C_,        F_[last_], J_[last_], history_, status_[last_],
-            impulse_,  time_, residual_, Tensor(),  Tensor(),  Tensor()};
+    return {x_[last_],      v_,       C_,    F_[last_], J_[last_], history_,
+            status_[last_], impulse_, time_, residual_, heat(),    heat_ ? heat_->status : Tensor(),
+            Tensor()};
   }
 
  private:
@@ -60,6 +63,7 @@ class CudaCall {
   Tensor v_, C_, residual_;    // read by G2P only
   Tensor status_[2], history_, impulse_, time_;
   Substeps<T, D> s_;
+  std::optional<HeatSteps<T, D>> heat_;
   Schedule schedule_;
   Particles<const T> from_;      // inputs of the next substep
   const int* before_ = nullptr;  // status before it
@@ -68,6 +72,8 @@ class CudaCall {
   int last_ = 0;                 // index of the buffer with the results of the last one
 
   int64_t P() const { return in_.x.size(0); }
+
+  Tensor heat() const { return heat_ ? heat_->fields.tensor() : Tensor(); }
 
   int* status(int k) { return static_cast<int*>(status_[k].data_ptr()); }
 
@@ -124,7 +130,13 @@ class CudaCall {
     s_.write(to);
     if (late_) s_.move_late(to, step_ > 0, last);
     s_.activate(before_, status(into), on);
+    if (heat_) heat_->begin(from_.F, from_.J, s_.p2g.volume, on);
     s_.move(on);
+    if (heat_) {
+      const Field<const int> scene{s_.activation.scene, {s_.activation.scene_stride}};
+      heat_->run(from_.x, s_.p2g.mass, constant(to.C), scene, on);
+    }
+    s_.end_time(on);
     before_ = status(into);
     from_ = constant(to);
   }

@@ -5,11 +5,12 @@
 #include "rollout/step_kernels.h"
 
 // A call of many substeps on CUDA that owns its particles: G2P and the next P2G are one kernel while an activation
-// lasts. Between substeps
-//   G2P          of the substep before,     \
-//   activation,                              |  if particles have moved too far for that,
-//   P2G          into the order of items;   /
-//   G2P2G        otherwise.
+// lasts. Between substeps, if particles have moved too far for that:
+//   G2P          of the substep before,
+//   activation,
+//   P2G          into the order of items;
+// otherwise:
+//   G2P2G.
 // All four are launched, and each checks on the device whether it has work.
 namespace mpm {
 

@@ -4,7 +4,7 @@
 
 #include "cpu/schedule.h"
 #include "rollout/heat_steps.h"
-#include "rollout/own_field.cpu.h"
+#include "rollout/own_field.h"
 #include "rollout/step_kernels.h"
 
 // The particles of a call on the CPU. They move in place and are reordered by cell from time to time, so that packs of

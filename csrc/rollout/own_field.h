@@ -7,7 +7,7 @@
 #include "common/tensors.h"
 #include "rollout/laws_p2g.h"
 
-// Fields of the particles of a call on the CPU, which are reordered between two buffers.
+// Fields of the particles of a call, written and reordered between two buffers.
 namespace mpm {
 
 // A field of the particles, [P, ...]: the given tensor, or one of two buffers.

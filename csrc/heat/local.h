@@ -1,0 +1,139 @@
+#pragma once
+
+#include <cmath>
+
+#include "common/lanes.h"
+#include "grid/box_distance.h"
+#include "grid/shapes.h"
+#include "heat/particle.h"
+#include "heat/transfer.h"
+
+// Work of a step of heat at one node, particle or scene. The loops of both backends go over them.
+namespace mpm {
+inline namespace TORCH_MPM_ISA {
+
+// ---- particles
+
+// β of a transfer that is not the hybrid: none for FLIP, all for APIC and PIC.
+template <class T>
+MPM_HD T blend_of(HeatTransfer transfer, const T& hybrid) {
+  return transfer == HeatTransfer::hybrid ? hybrid : T(transfer == HeatTransfer::flip ? 0 : 1);
+}
+
+template <class T, int D>
+MPM_HD void heat_volume(const HeatVolumesArguments<T, D>& a, int64_t p) {
+  const One<T> at{p};
+  T volume = load_scalar(at, a.rest);
+  if (a.J.pointer)
+    volume = volume * load_scalar(at, a.J);
+  else if (a.F.pointer)
+    volume = volume * determinant(load_matrix<D>(at, a.F));
+  store_scalar(at, a.volume, volume);
+}
+
+// Signed distance from an obstacle; infinite while it is not there. The kernel of contact needs no distance from the
+// edges of a box.
+template <class T, int D>
+MPM_HD T distance_from(const ObstaclePose<T, D>& pose, const Vector<T, D>& position) {
+  if (!pose.acts) return T(INFINITY);
+  const Vector<T, D> body = to_body(pose, position);
+  Vector<T, D> other;
+  if (pose.shape != ObstacleShape::box) return surface(pose, body, other);
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    other[i] = pose.row->extent[i];
+  return box_distance(body, other);
+}
+
+template <class T, int D>
+MPM_HD ObstaclePose<T, D> pose_of(const ContactArguments<T, D>& a, int obstacle, int scene) {
+  return obstacle_pose(a, a.kind[obstacle], a.row[(a.rows == 1 ? 0 : int64_t(scene)) * a.obstacles + obstacle], scene);
+}
+
+// Of a particle, clamped to those that exist.
+template <class T, int D>
+MPM_HD int scene_of_particle(const HeatLayersArguments<T, D>& a, int64_t p) {
+  const int scene = a.scene.pointer ? a.scene.pointer[p * a.scene.stride[0]] : 0;
+  return scene < 0 || a.scenes <= 0 ? 0 : scene < a.scenes ? scene : int(a.scenes - 1);
+}
+
+template <class T, int D>
+MPM_HD void heat_layer_of(const HeatLayersArguments<T, D>& a, const ObstaclePose<T, D>& pose, int64_t p) {
+  const One<T> at{p};
+  const T distance = distance_from(pose, load_vector<D>(at, a.x)), width = T(a.width);
+  T conductance = load_scalar(at, constant(a.conductance)), exchange = T(0);
+  if (!(distance >= width)) {
+    const HeatLayerAt<T> layer = heat_layer(distance, width);
+    exchange = conductance * layer.rate;
+    conductance = layer.share * conductance - exchange / T(a.inverse_inertia);
+    store_scalar(at, a.conductance, conductance);
+  }
+  store_scalar(at, a.exchange, exchange);
+}
+
+// ---- nodes
+
+template <class T, int D>
+MPM_HD void heat_mean(const HeatMeansArguments<T, D>& a, int64_t i) {
+  T* const sum = a.sums + i * kHeatChannels;
+  const T capacity = sum[kHeatCapacity], varying = sum[kHeatVarying];
+  const T theta = capacity > T(0) ? sum[kHeatTheta] / capacity : T(0);
+  a.theta[i] = theta;
+  a.capacity[i] = capacity;
+  sum[kHeatMean] = varying > T(0) ? sum[kHeatMean] / varying : T(0);
+  if (!a.start) return;
+  a.start[i] = theta;
+  a.fixed[i] = false;
+}
+
+template <class T, int D>
+MPM_HD void heat_increment(const HeatIncrementsArguments<T, D>& a, int64_t i) {
+  a.sums[i * kHeatChannels + kHeatTheta] = a.increment[i] + (a.start[i] - a.theta[i]);
+}
+
+template <class T, int D>
+MPM_HD void hold_node(const HeatHoldArguments<T, D>& a, const ObstaclePose<T, D>& pose, int scene,
+                      const int (&corner)[D], int local, int64_t i) {
+  if (a.fixed[i] || !(a.capacity[i] > T(0))) return;
+  if (!(distance_from(pose, node_position(a.contact, corner, local)) <= a.contact.rounding)) return;
+  a.fixed[i] = true;
+  a.theta[i] = a.temperature[scene * a.stride];
+}
+
+template <class T, int D>
+MPM_HD void heat_of_surface(const HeatFromSurfaceArguments<T, D>& a, int scene, int64_t i) {
+  a.source[i] = a.exchange[i] * a.temperature[scene * a.stride];
+}
+
+template <class T, int D>
+MPM_HD void heat_term(const HeatTermArguments<T, D>& a, int scene, int64_t i) {
+  const T* const sum = a.sums + i * kHeatChannels;
+  if (a.term == HeatTerm::power) {
+    a.source[i] += sum[0];
+    return;
+  }
+  T squared = T(0);
+  MPM_UNROLL for (int d = 0; d < D; d++)
+    squared += sum[1 + d] * sum[1 + d];
+  const T* const number = a.number + 2 * int64_t(scene);
+  const T amount = safe_root(squared) * number[0];
+  HeatRadiationAt<T> linear{T(0), amount};  // a flux
+  if (a.term == HeatTerm::convection) linear = {amount, amount * number[1]};
+  if (a.term == HeatTerm::radiation) linear = heat_radiation(amount, a.theta[i], number[1], T(a.reference));
+  a.exchange[i] += linear.coefficient;
+  a.source[i] += linear.power;
+}
+
+// ---- scenes
+
+// A paused scene has nothing to solve. A residual that is NaN stays.
+template <class T, int D>
+MPM_HD void count_solve(const HeatCountArguments<T, D>& a, int64_t scene) {
+  if (a.converged[scene] || (a.scene_dt && a.scene_dt[scene] == T(0))) return;
+  double* const row = a.status + scene * kHeatStatusSize;
+  const double residual = double(a.residual[scene]);
+  row[kUnsolved] += 1;
+  if (!(residual <= row[kLargestResidual])) row[kLargestResidual] = residual;
+}
+
+}  // namespace TORCH_MPM_ISA
+}  // namespace mpm
