@@ -44,6 +44,8 @@ PLASTIC_VOLUME = "log_plastic_volume"
 """History of laws whose plastic flow changes the volume: ln J_p."""
 ARGUMENTS = {"eta": "viscosity"}
 """Names of arguments that are stored under another name."""
+Range = tuple[str, Callable[[Any], Any]]
+"""Range of a parameter: in words, and a test of a number or of each entry of a tensor."""
 _NO_VALUES = frozenset({type(value) for value in vars(nn.Module()).values()} | {DeviceConstantCache, str})
 """Types of attributes that are no parameters, such as those that every module has."""
 FIGURES = ("stress", "stiffness", "energy_density")
@@ -73,12 +75,21 @@ class CompiledLaw(Material):
         self._functions = False
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Tensors that replace numbers become buffers, as those of the constructor."""
-        if isinstance(value, Tensor) and name in vars(self):
-            del vars(self)[name]
-            self._store(name, value)
-        else:
+        """A value that replaces a parameter is checked and stored as those of the constructor. Values of tensors on
+        other devices than the CPU are not checked, since that would wait for the device."""
+        stores = [self.__dict__.get(part, {}) for part in ("_parameters", "_buffers", "_modules")]
+        places = [part for part in (vars(self), *stores) if name in part]
+        range_ = self._range(name) if places else None
+        if range_ is None:
             super().__setattr__(name, value)
+            return
+        if not isinstance(value, Tensor) or (value.device.type == "cpu" and not is_traced(value)):
+            check_value(*(ARGUMENTS.get(name, name), value, *range_))
+        for part in places:
+            del part[name]
+        self._store(name, value)
+        functions = [name for name, v in self._stored() if callable(v) and not isinstance(v, Tensor)]
+        self._functions = any([self._range(name) is not None for name in functions])
 
     @staticmethod
     def _describe(target: Any) -> None:
@@ -267,10 +278,17 @@ class CompiledLaw(Material):
             return soa_empty(state.x, (P, D, D)).zero_()
         return torch.zeros_like(state.mass)
 
+    def _range(self, name: str) -> Range | None:
+        """Range of the parameter that is stored under a name; None for other attributes."""
+        info = LAWS.get(getattr(self, "name", ""))
+        found = [] if info is None else [p for p in info.parameters if p.name == name and name != "dt"]
+        return (found[0].expected, found[0].holds) if found else None
+
     def _add(self, name: str, value: Value) -> None:
         """Check a parameter of the law against its range and store it."""
-        quantity = LAWS[self.name].parameter(name)
-        self._store(name, check_value(name, value, quantity.expected, quantity.holds))
+        range_ = self._range(name)
+        assert range_ is not None
+        self._store(name, check_value(ARGUMENTS.get(name, name), value, *range_))
 
     def _store(self, name: str, value: Value) -> None:
         """Store a parameter as number, buffer, nn.Parameter or function, so that `.to` and optimizers find it."""
@@ -364,6 +382,15 @@ class CompiledLaw(Material):
         return self._kept_scalars.get((*numbers, x.dtype, x.device), make, x)
 
 
+MODULI: dict[str, Range] = {
+    "E": ("finite and not negative", lambda v: v >= 0),
+    "nu": ("between -1 and 0.5", lambda v: (v > -1) & (v < 0.5)),
+    "mu": ("finite and not negative", lambda v: v >= 0),
+    "lam": ("finite", lambda v: v == v),
+}
+"""Ranges of elastic moduli."""
+
+
 class SolidLaw(CompiledLaw):
     """A compiled law with two elastic moduli, given as Young's modulus and Poisson's ratio or as Lamé parameters.
 
@@ -385,14 +412,17 @@ class SolidLaw(CompiledLaw):
             found = ", ".join(given) or "nothing"
             raise ValueError(f"{type(self).__name__} needs E and nu, or mu and lam, got {found}")
         if E is not None and nu is not None:
-            self._store("E", check_value("E", E, "finite and not negative", lambda v: v >= 0))
-            self._store("nu", check_value("nu", nu, "between -1 and 0.5", lambda v: (v > -1) & (v < 0.5)))
+            self._add("E", E)
+            self._add("nu", nu)
             if len({v.numel() for v in (E, nu) if isinstance(v, Tensor) and v.numel() > 1}) > 1:
                 raise ValueError(f"E and nu must have one shape where both vary, got {shape_of(E)} and {shape_of(nu)}")
         elif mu is not None and lam is not None:
-            self._store("mu", check_value("mu", mu, "finite and not negative", lambda v: v >= 0))
-            self._store("lam", check_value("lam", lam, "finite", lambda v: v == v))
+            self._add("mu", mu)
+            self._add("lam", lam)
         self.engineering = E is not None
+
+    def _range(self, name: str) -> Range | None:
+        return MODULI.get(name) or super()._range(name)
 
     def values(self) -> Sequence[Value]:
         """μ and λ [Pa], then the other parameters of the law in its order, without the time step."""

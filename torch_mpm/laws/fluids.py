@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..ops.arguments import per_parameter
 from ..ops.registry import LAWS
-from .compiled import CompiledLaw, check_value
+from .compiled import CompiledLaw, Range
 from .parameters import Value
 
 if TYPE_CHECKING:
@@ -41,11 +41,27 @@ class WeaklyCompressible(CompiledLaw):
         super().__init__()
         self._add("bulk_modulus", bulk_modulus)
         self._add("gamma", gamma)
-        quantity = LAWS["viscous_fluid"].parameter("viscosity")
-        self._store("eta", check_value("viscosity", viscosity, quantity.expected, quantity.holds))
-        if isinstance(viscosity, Tensor) or callable(viscosity) or viscosity > 0:
+        self._add("eta", viscosity)
+        self._choose_law()
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name == "viscosity":
+            raise AttributeError("viscosity is a function of a state: assign the parameter as eta")
+        super().__setattr__(name, value)
+        if name == "eta":
+            self._choose_law()
+
+    def _choose_law(self) -> None:
+        """Call the viscous law from the first viscosity on that may be positive."""
+        if isinstance(self.eta, Tensor) or callable(self.eta) or self.eta > 0:
             self.name = "viscous_fluid"
             self._describe(self)
+
+    def _range(self, name: str) -> Range | None:
+        if name != "eta":
+            return super()._range(name)
+        quantity = LAWS["viscous_fluid"].parameter("viscosity")
+        return quantity.expected, quantity.holds
 
     def values(self) -> Sequence[Value]:
         """K [Pa], γ and, of a viscous fluid, η [Pa s]."""

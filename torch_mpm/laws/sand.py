@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -13,7 +13,7 @@ from ..cuda_graphs.capture import DeviceConstantCache
 from ..errors import check_flag, check_number
 from ..ops.registry import LAWS
 from ..ops.sand import ANGLE, ENERGIES, friction_alpha, law_name
-from .compiled import SolidLaw, check_value
+from .compiled import Range, SolidLaw
 from .parameters import Value
 
 if TYPE_CHECKING:
@@ -97,7 +97,6 @@ class QuarticSand(SolidLaw):
         self._kept_slope = DeviceConstantCache()
 
     def _set_friction(self, angle: Value | None, hardening: Sequence[Value] | None) -> None:
-        expected: tuple[str, Callable[[Any], Any]] = (ANGLE, lambda v: (v >= 0) & (v < math.pi / 2))
         self._friction = ("friction_angle",) if hardening is None else ("h0", "h1", "h2", "h3")
         if hardening is None:
             values: Sequence[Value] = (math.pi / 6 if angle is None else angle,)
@@ -106,11 +105,15 @@ class QuarticSand(SolidLaw):
         else:
             values = hardening
         for name, value in zip(self._friction, values, strict=True):
-            limits = ("finite and not negative", lambda v: v >= 0) if name in ("h1", "h2") else expected
-            self._store(name, check_value(name, value, *limits))
+            self._add(name, value)
         first, last = values[0], values[-1]
         if isinstance(first, float) and isinstance(last, float) and last > first:
             raise ValueError(f"h3 must not be above h0 (in radians), got {last} and {first}")
+
+    def _range(self, name: str) -> Range | None:
+        if name in ("friction_angle", "h0", "h3"):
+            return ANGLE, lambda v: (v >= 0) & (v < math.pi / 2)
+        return ("finite and not negative", lambda v: v >= 0) if name in ("h1", "h2") else super()._range(name)
 
     def values(self) -> Sequence[Value]:
         """μ and λ [Pa], the friction angle or h0 [rad], cohesion, smallest strain, and h1 to h3."""

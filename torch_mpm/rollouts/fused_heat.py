@@ -125,8 +125,15 @@ def _held(step: Step, x: Tensor) -> tuple[list[int], int, Tensor]:
 
 def _of_scenes(value: Any, like: Tensor, scenes: int) -> Tensor:
     """A value for each scene [B], from one of a shape that `_why_not_boundaries` supports."""
-    given = torch.as_tensor(value, dtype=like.dtype, device=like.device)
-    return given.detach().reshape(-1).expand(scenes)
+    return _like(value, like).detach().reshape(-1).expand(scenes)
+
+
+def _like(value: Any, like: Tensor) -> Tensor:
+    """A tensor of the dtype and on the device of another one. A number is written by a kernel: a copy would wait for
+    the device."""
+    if isinstance(value, Tensor):
+        return value.to(like)
+    return torch.full((), float(value), dtype=like.dtype, device=like.device)
 
 
 def _is_function(value: Any) -> bool:
@@ -155,7 +162,7 @@ def _tensor(name: str, value: Any, state: State, scenes: int) -> Tensor:
     check_length(name, value, len(state), scenes)
     of_particles = isinstance(value, PerMaterial) or getattr(value, "shape", None) == (len(state),)
     number = evaluate(name, value, state) if of_particles else value
-    return torch.as_tensor(number, dtype=state.mass.dtype, device=state.mass.device)
+    return _like(number, state.mass)
 
 
 def heat_arguments(step: Step, state: State) -> tuple[Any, ...]:
