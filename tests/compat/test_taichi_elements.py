@@ -274,6 +274,7 @@ def test_a_restart_continues():
             "g must be 2 numbers, got a tensor that requires grad",
         ),
         (lambda: MPMSolver((8, 8)).step(0.0), ValueError, "frame_dt must be positive"),
+        (lambda: MPMSolver((8, 8)).step(1e9), ValueError, "frame_dt must be at most"),
     ],
 )
 def test_what_cannot_be_done_is_said(call, error, message):

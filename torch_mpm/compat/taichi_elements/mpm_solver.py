@@ -25,6 +25,9 @@ from . import materials
 from .materials import law_indices, mixture_of, shapeless
 from .seeding import in_box, in_ellipsoid, in_polygon
 
+MOST_SUBSTEPS = 10**9
+"""Largest number of substeps of a call."""
+
 DENSITY = 1000.0
 """Density of all materials [kg/m³]."""
 WHITE = 0xFFFFFF
@@ -339,8 +342,15 @@ class MPMSolver:
             frame_dt: [s]
             print_stat: whether to print the number of particles and substeps.
             smry_writer: not supported.
+
+        Raises:
+            ValueError: for a frame_dt that is not positive and finite, or of more than 1e9 substeps.
         """
         check_number("frame_dt", frame_dt, "positive and finite", lambda v: 0 < v < math.inf)
+        if frame_dt / self.default_dt > MOST_SUBSTEPS:
+            raise ValueError(
+                f"frame_dt must be at most {MOST_SUBSTEPS:.0e} substeps of {self.default_dt:.3g} s, got {frame_dt} s"
+            )
         if smry_writer is not None:
             raise NotImplementedError("smry_writer has no scalars here: read solver.state after each step")
         dt = frame_dt / (int(frame_dt / self.default_dt) + 1)
