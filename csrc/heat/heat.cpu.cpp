@@ -165,15 +165,6 @@ struct HeatSolver {
   }
   bool running(int scene) const { return scene >= 0 && w.scene[scene].running; }
 
-  // Number of steps d += (M/dt + X)⁻¹ r that a known bound c of the spectrum shows to suffice, since each multiplies
-  // the residual by c at most; zero where it is unknown or too large. Such scenes need no diagonal and no scalar
-  // products.
-  int simple_steps(int scene) const {
-    if (!a.scene_bound || scene < 0) return 0;
-    const double c = a.scene_bound[scene];
-    return c <= a.relative_tolerance ? 1 : c * c <= a.relative_tolerance ? 2 : 0;
-  }
-
   void start() const {
     const int64_t nodes = a.topology.max_blocks * int64_t(kBlockNodes<D>);
     parallel_ranges(nodes, 65536, [&](int64_t begin, int64_t end) {
@@ -186,7 +177,7 @@ struct HeatSolver {
     if (a.method == HeatMethod::chebyshev)
       sum_to<HeatSum::bound>(nullptr, w.v.weight, all, nothing);
     else
-      sum_to<HeatSum::diagonal>(nullptr, w.v.inverse, [&](int scene) { return !simple_steps(scene); }, nothing);
+      sum_to<HeatSum::diagonal>(nullptr, w.v.inverse, [&](int scene) { return simple_steps(a, scene) == 0; }, nothing);
     for_slots(all, [&](int64_t slot, int scene, int64_t first) {
       auto sums = StartSums<T>::zero();
       const double dt = scene < 0 ? 1 : step_of_scene(a, scene);
@@ -202,8 +193,8 @@ struct HeatSolver {
 
   // Solves the scenes for which a few steps without scalar products suffice.
   void solve_by_simple_steps() const {
-    const auto simple = [&](int scene) { return running(scene) && simple_steps(scene) > 0; };
-    const auto twice = [&](int scene) { return running(scene) && simple_steps(scene) > 1; };
+    const auto simple = [&](int scene) { return running(scene) && w.scene[scene].simple > 0; };
+    const auto twice = [&](int scene) { return running(scene) && w.scene[scene].simple > 1; };
     bool any = false, again = false;
     for (int scene = 0; scene < a.topology.scenes; scene++) any |= simple(scene), again |= twice(scene);
     if (!any) return;
@@ -220,14 +211,7 @@ struct HeatSolver {
       });
     }
     for (int scene = 0; scene < a.topology.scenes; scene++)
-      if (simple(scene)) finish_simple(w.scene[scene], simple_steps(scene), a.scene_bound[scene]);
-  }
-  static void finish_simple(HeatScene& s, int steps, double bound) {
-    s.residual *= steps == 1 ? bound : bound * bound;
-    s.iterations = steps;
-    s.heat = s.dt * s.source;  // these steps conserve the energy
-    s.converged = true;
-    s.running = false;
+      if (simple(scene)) finish_simple_steps(a, scene, w.scene[scene]);
   }
 
   // f(scene, sum over its slots); the order of the sums does not depend on threads.

@@ -224,6 +224,16 @@ struct HeatKernel {
 
   __device__ void start(WarpMemory<S>& memory) const;
   __device__ void direct(bool first) const;
+  // The last of a few steps without scalar products.
+  __device__ void take_last_step(int slot, int end) const {
+    for_quads(slot, end, [&](int64_t i) {
+      const Vec4<T> inverse = load_vec4(w.v.inverse + i), r = load_vec4(w.v.r + i);
+      Vec4<T> increment = load_vec4(a.increment + i);
+#pragma unroll
+      for (int k = 0; k < kBlockWidth; k++) increment.e[k] += inverse.e[k] * r.e[k];
+      store_vec4(a.increment + i, increment);
+    });
+  }
   __device__ void product(WarpMemory<S>& memory) const {
     sum_to<HeatSum::product>(w.v.p, w.v.product, memory, [&](int scene) { return w.scene[1][scene].running; });
     wait_for_all();
@@ -262,7 +272,8 @@ __device__ void HeatKernel<Order, T, D>::start(WarpMemory<S>& memory) const {
   if (a.method == HeatMethod::chebyshev)
     sum_to<HeatSum::bound>(nullptr, w.v.weight, memory, all);
   else
-    sum_to<HeatSum::diagonal>(nullptr, w.v.inverse, memory, all);
+    sum_to<HeatSum::diagonal>(nullptr, w.v.inverse, memory,
+                              [&](int scene) { return takes(scene) && simple_steps(a, scene) == 0; });
   wait_for_all();
   for_slots([&](int scene, int slot, int end, bool) {
     const double dt = step_of_scene(a, scene);
@@ -300,7 +311,6 @@ __device__ void HeatKernel<Order, T, D>::direct(bool first) const {
       add_parts(w.start, scene, range.slot_block, range.slot_block_end, sums);
       sums = sum_of_block(sums);
       s = decide([&] { return start_scene(a, scene, sums); });
-      if (owner && threadIdx.x == 0 && s.running) atomicAdd(w.running, 1);
     } else {
       s = w.scene[0][scene];
       if (s.running) {
@@ -315,7 +325,14 @@ __device__ void HeatKernel<Order, T, D>::direct(bool first) const {
         if (owner && threadIdx.x == 0 && !s.running) atomicSub(w.running, 1);
       }
     }
-    if (owner && threadIdx.x == 0) w.scene[1][scene] = s;
+    const bool last = is_last_simple_step(s);
+    if (last) finish_simple_steps(a, scene, s);
+    if (owner && threadIdx.x == 0) {
+      if (first && s.running) atomicAdd(w.running, 1);
+      if (!first && last) atomicSub(w.running, 1);
+      w.scene[1][scene] = s;
+    }
+    if (last) return take_last_step(slot, end);
     if (!s.running) return;
     const T beta = T(s.beta), gamma = T(s.gamma);
     Curvature sum{0};
@@ -340,7 +357,7 @@ __device__ void HeatKernel<Order, T, D>::update() const {
   for_slots([&](int scene, int slot, int end, bool owner) {
     const SceneRange range = w.range[scene];
     HeatScene s = w.scene[1][scene];
-    if (s.running && a.method == HeatMethod::conjugate_gradients) {
+    if (s.running && a.method == HeatMethod::conjugate_gradients && s.simple == 0) {
       Curvature sum{0};
       add_parts(w.item_curvature, scene, range.item_block, range.item_block_end, sum);
       add_parts(w.slot_curvature, scene, range.slot_block, range.slot_block_end, sum);

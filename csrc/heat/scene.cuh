@@ -417,7 +417,7 @@ struct SceneSolver {
     const bool chebyshev = a.method == HeatMethod::chebyshev;
     if (chebyshev)
       sum_cells<HeatSum::bound>(nullptr, p);
-    else
+    else if (simple_steps(a, scene) == 0)
       sum_cells<HeatSum::diagonal>(nullptr, p);
     const double dt = step_of_scene(a, scene);
     auto sums = StartSums<double>::zero();
@@ -433,14 +433,23 @@ struct SceneSolver {
     __syncthreads();
   }
 
+  // The last of a few steps without scalar products.
+  __device__ void take_last_step() const {
+    for_nodes([&](int i) { d[i] += v.inverse[i] * v.r[i]; });
+    __syncthreads();  // all have read the scene
+    if (threadIdx.x == 0) finish_simple_steps(k.a, scene, s.scene);
+    __syncthreads();
+  }
+
   __device__ void iterate() const {
+    if (is_last_simple_step(s.scene)) return take_last_step();
     const HeatMethod method = k.a.method;
     const T beta = T(s.scene.beta), gamma = T(s.scene.gamma);
     Curvature curvature{0};
     for_nodes([&](int i) { curvature.value += direct_node(v, i, beta, gamma); });
     __syncthreads();
     curvature.value += sum_cells<HeatSum::product>(p, product);
-    if (method == HeatMethod::conjugate_gradients) {
+    if (method == HeatMethod::conjugate_gradients && s.scene.simple == 0) {
       curvature = sum_of_block(curvature);
       if (threadIdx.x == 0) set_step(s.scene, curvature.value);
       __syncthreads();

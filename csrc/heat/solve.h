@@ -35,7 +35,8 @@ struct HeatArguments {
   int most = 0;                        // maximum number of iterations, replaced by scene_most where given
   const int* scene_most = nullptr;     // [scenes]
   HeatMethod method = HeatMethod::conjugate_gradients;
-  const double* scene_bound = nullptr;  // [scenes], of the spectrum of H in units of M/dt + X, where it is known (CPU)
+  const double* scene_bound = nullptr;  // [scenes], of the spectrum of H in units of M/dt + X where it is known, but
+  double bound_scale = 1;               // for this factor
   bool deterministic = false;
   T* increment = nullptr;     // [N]
   int* iterations = nullptr;  // [scenes], as those below
@@ -105,6 +106,7 @@ struct HeatScene {
   double dt, mass, source, heat, tolerance, residual, preconditioned, bound, spread, rho;
   double alpha, beta, gamma;
   int iterations, most;
+  int simple;  // steps of simple_steps()
   bool running, closed, converged;
 };
 
@@ -113,6 +115,31 @@ inline namespace TORCH_MPM_ISA {
 template <class T, int D>
 MPM_HD double step_of_scene(const HeatArguments<T, D>& a, int scene) {
   return a.scene_dt ? a.dt * double(a.scene_dt[scene]) : a.dt;
+}
+
+// Number of steps d += (M/dt + X)⁻¹ r that a known bound c of the spectrum shows to suffice, since each multiplies the
+// residual by c at most; zero where it is unknown or too large. Such scenes need no diagonal and no scalar products.
+template <class T, int D>
+MPM_HD int simple_steps(const HeatArguments<T, D>& a, int scene) {
+  if (!a.scene_bound || scene < 0 || a.method != HeatMethod::conjugate_gradients) return 0;
+  const double c = a.bound_scale * a.scene_bound[scene];
+  return c <= a.relative_tolerance ? 1 : c * c <= a.relative_tolerance ? 2 : 0;
+}
+
+// Whether the next step is the last one of them: it needs neither H p nor the residual.
+MPM_HD bool is_last_simple_step(const HeatScene& s) {
+  return s.running && s.simple > 0 && s.iterations + 1 >= s.simple;
+}
+
+// After it. These steps conserve the energy.
+template <class T, int D>
+MPM_HD void finish_simple_steps(const HeatArguments<T, D>& a, int scene, HeatScene& s) {
+  const double c = a.bound_scale * a.scene_bound[scene];
+  s.residual *= s.simple == 1 ? c : c * c;
+  s.iterations = s.simple;
+  s.heat = s.dt * s.source;
+  s.converged = true;
+  s.running = false;
 }
 
 // First right side, for zero increment, of node i of the vectors, which lies in `row`. `used` is false for rows of
@@ -216,6 +243,7 @@ MPM_HD HeatScene start_scene(const HeatArguments<T, D>& a, int scene, const Star
   s.running = s.residual > s.tolerance && s.residual < HUGE_VAL && s.most > 0;
   s.converged = s.residual <= s.tolerance;
   s.alpha = s.gamma = 1;
+  s.simple = simple_steps(a, scene);
   if (a.method == HeatMethod::chebyshev && s.running) {
     s.most = chebyshev_count(s);
     direct_chebyshev(s);
@@ -231,7 +259,7 @@ MPM_HD void set_step(HeatScene& s, double curvature) {
 
 // Whether the sums after an iteration are needed.
 MPM_HD bool wants_sums(const HeatScene& s, HeatMethod method) {
-  return method != HeatMethod::chebyshev || s.iterations + 1 >= s.most;
+  return s.simple == 0 && (method != HeatMethod::chebyshev || s.iterations + 1 >= s.most);
 }
 
 MPM_HD void finish_iteration(HeatScene& s, HeatMethod method, const StepSums<double>& sums) {
@@ -243,6 +271,7 @@ MPM_HD void finish_iteration(HeatScene& s, HeatMethod method, const StepSums<dou
     s.converged = s.residual <= s.tolerance;
     s.running = s.residual > s.tolerance && s.iterations < s.most;
   }
+  if (s.simple > 0) return;
   if (method == HeatMethod::chebyshev) return direct_chebyshev(s);
   s.beta = sums.preconditioned / s.preconditioned;
   s.preconditioned = sums.preconditioned;

@@ -1,6 +1,5 @@
 #pragma once
 
-#include <algorithm>
 #include <optional>
 
 #include "heat/kernels.h"
@@ -99,7 +98,7 @@ class HeatSteps {
   std::vector<HeatValue<T>> values_;              // of the parameters; those per particle have no pointer
   std::vector<int> own_;                          // index in `parameters`, or -1
   Tensor conductance_, blend_, number_, changing_;
-  std::vector<double> bounds_;    // of the spectrum of each scene on the CPU, see HeatArguments
+  Tensor largest_;                // diffusion number of a particle in each scene
   Field<const T> temperatures_;   // of the held obstacles [K, B]
   Tensor exchange_of_particles_;  // with the held surface
   Tensor start_, fixed_, source_, exchange_, surface_;
@@ -137,7 +136,7 @@ HeatSteps<T, D>::HeatSteps(Substeps<T, D>& steps) : s_(steps), in_(steps.in) {
   blend_ = empty(x, {P});
   number_ = empty(x, {P});
   if (melts()) changing_ = empty(x, {P});
-  bounds_.resize(size_t(in_.scenes));
+  largest_ = empty(x, {in_.scenes}, ScalarType::Double);
   status = empty(x, {in_.scenes, int64_t(kHeatStatusSize)}, ScalarType::Double);
   torch::stable::zero_(status);
   iterations_ = empty_int(x, {in_.scenes});
@@ -385,13 +384,12 @@ void HeatSteps<T, D>::solve(const Field<const T>& x, const Field<const int>& sce
   a.tolerance = kNegligibleResidual;
   a.relative_tolerance = in_.heat_scalars[0];
   a.most = int(in_.heat_options[1]);
-  if (MPM_BACKEND == MPM_BACKEND_IS_cpu) {
-    // With W = M/dt, u · H u ≤ Σ K_i u_i² and K_i = D⁻¹ Σ_p κ_p V_p N_i ≤ D⁻¹ dx² max_p r_p W_i (csrc/heat/cell.h).
-    std::fill(bounds_.begin(), bounds_.end(), 0.0);
-    find_largest(field<const T>(number_), scene, bounds_.data(), 1, stream);
-    for (double& bound : bounds_) bound *= in_.lattice.inverse_inertia() * in_.lattice.dx() * in_.lattice.dx();
-    a.scene_bound = bounds_.data();
-  }
+  // With W = M/dt, u · H u ≤ Σ K_i u_i² and K_i = D⁻¹ Σ_p κ_p V_p N_i ≤ D⁻¹ dx² max_p r_p W_i (csrc/heat/cell.h).
+  double* const largest = static_cast<double*>(largest_.data_ptr());
+  backend::clear(largest_, stream);
+  find_largest(field<const T>(number_), scene, largest, 1, stream);
+  a.scene_bound = largest;
+  a.bound_scale = in_.lattice.inverse_inertia() * in_.lattice.dx() * in_.lattice.dx();
   a.deterministic = in_.lattice.deterministic();
   if (held_nodes() > 0) hold_nodes(a, stream);
   if (exchanges()) a.exchange = field<const T>(exchange_).pointer, a.source = field<const T>(source_).pointer;
