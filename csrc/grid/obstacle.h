@@ -122,6 +122,13 @@ MPM_HD int step_of_call(const ContactArguments<T, D>& a) {
   return *a.activations - 1 - (a.activations_before ? *a.activations_before : 0);
 }
 
+// Rows of the obstacles of a scene in this step.
+template <class T, int D>
+MPM_HD const ObstacleRow<T, D>* rows_of_scene(const ContactArguments<T, D>& a, int scene) {
+  const ObstacleRow<T, D>* const row = a.row + (a.rows == 1 ? 0 : int64_t(scene) * a.obstacles);
+  return a.step_stride && a.activations ? row + step_of_call(a) * a.step_stride : row;
+}
+
 template <class T, int D>
 MPM_HD double contact_time(const ContactArguments<T, D>& a, int scene) {
   if (a.scene_time) return a.scene_time[a.times == 1 ? 0 : scene];

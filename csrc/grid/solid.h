@@ -89,8 +89,7 @@ MPM_HD ContactSlot<T, D> contact_slot(const ContactArguments<T, D>& a, int scene
   ContactSlot<T, D> s;
   s.scene = scene;
   s.active = (a.rows == 1 || scene < a.rows) && (!a.scene_time || a.times == 1 || scene < a.times);
-  s.row = a.row + (a.rows == 1 ? 0 : int64_t(scene) * a.obstacles);
-  if (a.step_stride && a.activations) s.row += step_of_call(a) * a.step_stride;
+  s.row = rows_of_scene(a, scene);
   MPM_UNROLL for (int i = 0; i < D; i++)
     s.corner[i] = corner[i];
   if (!s.active) return s;

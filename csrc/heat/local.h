@@ -46,7 +46,7 @@ MPM_HD T distance_from(const ObstaclePose<T, D>& pose, const Vector<T, D>& posit
 
 template <class T, int D>
 MPM_HD ObstaclePose<T, D> pose_of(const ContactArguments<T, D>& a, int obstacle, int scene) {
-  return obstacle_pose(a, a.kind[obstacle], a.row[(a.rows == 1 ? 0 : int64_t(scene)) * a.obstacles + obstacle], scene);
+  return obstacle_pose(a, a.kind[obstacle], rows_of_scene(a, scene)[obstacle], scene);
 }
 
 // Of a particle, clamped to those that exist.

@@ -203,6 +203,7 @@ void HeatSteps<T, D>::add_layers(const Field<const T>& x, const Field<const int>
   down.topology = s_.p2g.topology;
   down.x = x;
   down.value = field<const T>(exchange_of_particles_);
+  down.deterministic = in_.lattice.deterministic();
   down.nodes = {exchange, 1, 1};
   backend::scatter(in_.lattice.order(), down, stream);
   backend::heat_from_surface(

@@ -467,7 +467,7 @@ def test_absent_particles_and_those_outside_keep_their_heat(dim, transfer, devic
     step, state = scene(dim, transfer=transfer, melts=True, scenes=2, device=device)
     step.walls = None
     absent = torch.arange(len(state)) % 3 == 0
-    outside = torch.tensor([500.0, *[0.0] * (dim - 1)], dtype=torch.float64)
+    outside = torch.tensor([500.0, *[0.0] * (dim - 1)], dtype=torch.float64, device=device)
     state = state.replace(
         scene=state.scene.where(~absent, -1), v=torch.where(state.scene[:, None] == 1, outside, state.v)
     )
@@ -488,7 +488,7 @@ def test_parameters_of_particles_in_another_order(dim, melts, device):
     """Values of particles belong to their ids."""
     step, state = scene(dim, melts=melts, per_particle=True, device=device)
     step.heat.boundaries = [heat_boundaries.Source(1e8 * (1 + state.x[:, 0]))]
-    order = torch.randperm(len(state), generator=torch.Generator().manual_seed(3))
+    order = torch.randperm(len(state), generator=torch.Generator().manual_seed(3)).to(device)
     permuted = state.select(order).replace(ids=order)
     end = compare(step, permuted)
     with torch.no_grad():
