@@ -36,6 +36,8 @@ struct ObstacleRow {
   static constexpr int width = 3 * D + 2 * angles + 2;
 };
 
+constexpr int kKnownNodes = 1 << 14;
+
 template <class T, int D>
 struct ContactArguments {
   Geometry<T, D> geometry;
@@ -68,6 +70,10 @@ struct ContactArguments {
   int64_t stride = 0, grad_stride = 0, mass_stride = 0;
   T* result =
       nullptr;  // rows [max_blocks * 4^D, 1 + D] as of the grid update, the first column zero or a mass' adjoint
+  // On CUDA, for a call of many substeps: surfaces that nodes meet where the obstacles rest, found once, in a table by
+  // node [kKnownNodes]; zero on entry, see `recall`.
+  unsigned long long* known_nodes = nullptr;
+  void* known = nullptr;  // MetSurfaces
   T* row_grad = nullptr;  // adjoint of the rows by each slot [max_blocks, obstacles, width], or null; backward only
 };
 
@@ -101,6 +107,15 @@ MPM_HD Matrix<T, 3> rotation_matrix(const T (&vector)[3], const T& factor) {
   const T first = s * cos(half), second = T(0.5) * s * s;
   const Matrix<T, 3> cross = {{{T(0), T(0) - z, y}, {z, T(0), T(0) - x}, {T(0) - y, x, T(0)}}};
   return identity<T, 3>() + first * cross + second * (cross * cross);
+}
+
+// Whether a rotation turns nothing; that of dual numbers may have a derivative.
+template <class T, int N>
+MPM_HD bool is_at_rest(const T (&angle)[N]) {
+  bool rests = std::is_floating_point_v<T>;
+  if constexpr (std::is_floating_point_v<T>) MPM_UNROLL
+    for (int i = 0; i < N; i++) rests = rests && angle[i] == T(0);
+  return rests;
 }
 
 // An obstacle at a time. S is the scalar of its parameters, T or a dual number.
@@ -150,7 +165,9 @@ MPM_HD ObstaclePose<S, D> obstacle_pose(const ContactArguments<T, D>& a, const O
   const S elapsed = lift<S>(T(time - kind.start)), moved = a.step_stride ? S(T(0)) : elapsed;
   MPM_UNROLL for (int i = 0; i < D; i++)
     p.centre[i] = row.position[i] + row.velocity[i] * moved;
-  p.rotation = rotation_matrix(row.angular_velocity, elapsed) * rotation_matrix(row.rotation, S(1));
+  // Most obstacles do not turn, and the matrices take longer than the rest of contact.
+  p.rotation = is_at_rest(row.rotation) ? identity<S, D>() : rotation_matrix(row.rotation, S(1));
+  if (!is_at_rest(row.angular_velocity)) p.rotation = rotation_matrix(row.angular_velocity, elapsed) * p.rotation;
   return p;
 }
 

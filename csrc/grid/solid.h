@@ -241,10 +241,10 @@ class SolidAt {
 
   // Finds the faces that the node meets; their number is zero where none is near enough.
   MPM_HD void find(bool wanted) {
-    for (uint64_t left = wanted ? poses_.s.near : 0; any_of_warp(left != 0); left &= left - 1)
-      add_faces(left != 0, lowest_bit(left));
+    MPM_LOOP for (uint64_t left = wanted ? poses_.s.near : 0; any_of_warp(left != 0); left &= left - 1)
+        add_faces(left != 0, lowest_bit(left));
     Foot<T, D> foot;
-    while (true) {
+    MPM_LOOP while (true) {
       wanted = wanted && next_set(foot);
       if (!any_of_warp(wanted)) break;
       try_foot(wanted, foot);
@@ -260,8 +260,8 @@ class SolidAt {
   MPM_HD void add(Face<T, D>& face) {
     face.rounded = rounded_depth(a_, face.depth);
     int at = faces_.count < kMostFaces ? faces_.count++ : kMostFaces;
-    for (; at > 0 && goes_before(face, faces_.e[at - 1]); at--)
-      if (at < kMostFaces) faces_.e[at] = faces_.e[at - 1];
+    MPM_LOOP for (; at > 0 && goes_before(face, faces_.e[at - 1]); at--) if (at < kMostFaces) faces_.e[at] =
+        faces_.e[at - 1];
     if (at < kMostFaces) faces_.e[at] = face;
   }
 
@@ -278,11 +278,11 @@ class SolidAt {
 
   // By the sizes of components, as a box alone has it, and then by their signs; equal where these are nearly so.
   MPM_HD static bool is_greater(const V& x, const V& y) {
-    for (int i = 0; i < D; i++) {
+    MPM_LOOP for (int i = 0; i < D; i++) {
       const T size = rounded_component(abs(x[i])), other = rounded_component(abs(y[i]));
       if (size != other) return size > other;
     }
-    for (int i = 0; i < D; i++) {
+    MPM_LOOP for (int i = 0; i < D; i++) {
       const T own = rounded_component(x[i]), other = rounded_component(y[i]);
       if (own != other) return own > other;
     }
@@ -294,15 +294,15 @@ class SolidAt {
   // deepest face is deeper than the best foot are skipped.
   MPM_HD bool next_set(Foot<T, D>& foot) const {
     int at = 0;
-    while (at < foot.count && foot.member[at] + 1 == (at + 1 < foot.count ? foot.member[at + 1] : faces_.count)) at++;
+    MPM_LOOP while (at < foot.count &&
+                    foot.member[at] + 1 == (at + 1 < foot.count ? foot.member[at + 1] : faces_.count)) at++;
     const bool ends = at == foot.count || (at == foot.count - 1 && is_deeper(foot.member[at] + 1));
     if (ends && (foot.count == D || foot.count == faces_.count || is_deeper(foot.count))) return false;
     if (ends)
       at = foot.count++;
     else
       foot.member[at]++;
-    for (int i = 0; i < foot.count; i++)
-      if (i < at || ends) foot.member[i] = i;
+    MPM_LOOP for (int i = 0; i < foot.count; i++) if (i < at || ends) foot.member[i] = i;
     return true;
   }
 
@@ -326,7 +326,7 @@ class SolidAt {
     const bool is_box = wanted && shape_of(k) == ObstacleShape::box;  // whose faces are all far where it is
     V unused;
     if (!(height_of(is_box, k, node_, unused) <= reach_)) count = 0;
-    for (int f = 0; any_of_warp(f < count); f++) add_face(f < count, k, count == 1 ? -1 : f);
+    MPM_LOOP for (int f = 0; any_of_warp(f < count); f++) add_face(f < count, k, count == 1 ? -1 : f);
   }
 
   MPM_HD void add_face(bool wanted, int k, int f) {
@@ -363,7 +363,7 @@ class SolidAt {
     // and the nearest point is still inside. Samples round a ridge by a quarter of their spacing.
     const T slack = T(0.5) * seam_ + T(0.25) * spacing;
     const bool ridge = has_others(wanted && start < T(0) - slack, k, nearest.depth);
-    for (int i = 0; i < kLeaning; i++) {
+    MPM_LOOP for (int i = 0; i < kLeaning; i++) {
       V normal;
       const V at = seen_from(wanted, k, first, nearest.normal, away, i);
       const T height = height_of(wanted, k, at, normal);
@@ -377,7 +377,7 @@ class SolidAt {
     }
     const bool flat = wanted && nearest.flat, is_face = is_a_face(flat, k, first, nearest.normal);
     if (wanted && (is_face || !flat)) add(nearest);
-    for (int i = 0; i < kLeaning; i++) add_plane(flat, k, seen_from(flat, k, first, nearest.normal, away, i));
+    MPM_LOOP for (int i = 0; i < kLeaning; i++) add_plane(flat, k, seen_from(flat, k, first, nearest.normal, away, i));
     const bool is_between = ridge && flat;
     return is_covered(wanted && !is_between, k, first, nearest.normal, start) || is_between;
   }
@@ -387,7 +387,7 @@ class SolidAt {
     const T away = 2 * seam_ + depth;
     bool found = wanted && nearest_wall(a_, node_) <= away;
     uint64_t left = wanted && !found ? poses_.s.near & ~(uint64_t(1) << k) : 0;
-    while (any_of_warp(left != 0)) {
+    MPM_LOOP while (any_of_warp(left != 0)) {
       V unused;
       const T height = height_of(left != 0, lowest_bit(left), node_, unused);
       found = found || (left && height <= away);
@@ -414,9 +414,9 @@ class SolidAt {
     constexpr int count = D == 2 ? 9 : 27;
     Matrix<T, D> rotation = {};
     if (wanted) rotation = poses_[k].rotation;
-    for (int i = 1; i < count; i++) {
+    MPM_LOOP for (int i = 1; i < count; i++) {
       V way;
-      for (int j = 0, rest = i; j < D; j++, rest /= 3) way[j] = T(rest % 3 == 2 ? -1 : rest % 3);
+      MPM_LOOP for (int j = 0, rest = i; j < D; j++, rest /= 3) way[j] = T(rest % 3 == 2 ? -1 : rest % 3);
       const V at = node_ + reach_ * (rotation * way);
       add_plane(sees_a_face(wanted, k, at), k, at);
     }
@@ -438,7 +438,7 @@ class SolidAt {
     face.depth = T(0) - (face.height + dot(face.normal, node_ + T(-1) * face.at));
     if (!wanted || !(face.height >= T(0)) || !(dot(face.normal, face.normal) > T(0.5))) return;
     if (!(face.depth >= T(0) - seam_) || face.depth > reach_) return;
-    for (int j = 0; j < faces_.count; j++) {
+    MPM_LOOP for (int j = 0; j < faces_.count; j++) {
       const Face<T, D>& known = faces_.e[j];
       if (known.is_plane && known.obstacle == k && dot(known.normal, face.normal) > T(kSame)) return;
     }
@@ -477,14 +477,14 @@ class SolidAt {
   // The nearest point on all faces of a foot; false where there is none whose faces all stop the node.
   MPM_HD bool solve(bool wanted, Foot<T, D>& foot) const {
     bool curved = false;
-    for (int i = 0; i < foot.count; i++) curved = curved || !faces_.e[foot.member[i]].flat;
+    MPM_LOOP for (int i = 0; i < foot.count; i++) curved = curved || !faces_.e[foot.member[i]].flat;
     foot.at = node_;
     const int rounds = curved && foot.count > 1 ? 3 : 1;
-    for (int round = 0; any_of_warp(wanted && round < rounds); round++) {
+    MPM_LOOP for (int round = 0; any_of_warp(wanted && round < rounds); round++) {
       const bool acts = wanted && round < rounds;
       V normal[D];
       T share[D];
-      MPM_UNROLL for (int i = 0; i < D; i++) {
+      MPM_LOOP for (int i = 0; i < D; i++) {
         const T height = height_at(acts && i < foot.count, faces_.e[foot.member[i]], foot.at, normal[i]);
         share[i] = dot(normal[i], foot.at + T(-1) * node_) - height;
       }
@@ -496,13 +496,13 @@ class SolidAt {
   // Of faces by their normals and how far along each the node is from them.
   MPM_HD bool move_to_faces(const V (&normal)[D], T (&share)[D], Foot<T, D>& foot) const {
     T gram[D][D], again[D][D], ones[D];
-    for (int i = 0; i < foot.count; i++) {
+    MPM_LOOP for (int i = 0; i < foot.count; i++) {
       ones[i] = T(1);
-      for (int j = 0; j < foot.count; j++) gram[i][j] = again[i][j] = dot(normal[i], normal[j]);
+      MPM_LOOP for (int j = 0; j < foot.count; j++) gram[i][j] = again[i][j] = dot(normal[i], normal[j]);
     }
     if (!solve_definite<T, D>(gram, share, foot.count) || !solve_definite<T, D>(again, ones, foot.count)) return false;
     foot.at = node_, foot.step = zero_vector<T, D>();
-    for (int i = 0; i < foot.count; i++) {
+    MPM_LOOP for (int i = 0; i < foot.count; i++) {
       if (share[i] < T(0) - (foot.count > 1 ? seam_ / 2 : a_.rounding)) return false;
       foot.at = foot.at + share[i] * normal[i];
       foot.step = foot.step + ones[i] * normal[i];
@@ -512,7 +512,7 @@ class SolidAt {
 
   // Whether the faces are there on the side of the foot where they bound free space, and that is free.
   MPM_HD bool is_exposed(bool wanted, const Foot<T, D>& foot) const {
-    for (int i = 0; any_of_warp(wanted && i < foot.count); i++) {
+    MPM_LOOP for (int i = 0; any_of_warp(wanted && i < foot.count); i++) {
       const bool acts = wanted && i < foot.count;
       const Face<T, D>& face = faces_.e[foot.member[acts ? i : 0]];
       T near = seam_ / 2;
@@ -532,12 +532,12 @@ class SolidAt {
   // tangents of a rounded body meet outside. Of samples, which round edges; others do not get here.
   MPM_HD bool is_inner(bool wanted, const Foot<T, D>& foot) const {
     bool sampled = false;
-    for (int i = 0; i < foot.count; i++) sampled = sampled || is_of_samples(foot, i);
+    MPM_LOOP for (int i = 0; i < foot.count; i++) sampled = sampled || is_of_samples(foot, i);
     if (!any_of_warp(wanted && sampled)) return wanted;
     V normal[D], unused;
-    MPM_UNROLL for (int i = 0; i < D; i++)
-      height_at(wanted && sampled && i < foot.count, faces_.e[foot.member[i]], foot.at, normal[i]);
-    MPM_UNROLL for (int i = 0; i < D; i++) {
+    MPM_LOOP for (int i = 0; i < D; i++)
+        height_at(wanted && sampled && i < foot.count, faces_.e[foot.member[i]], foot.at, normal[i]);
+    MPM_LOOP for (int i = 0; i < D; i++) {
       const bool acts = wanted && i < foot.count && is_of_samples(foot, i);
       const int k = faces_.e[foot.member[i]].obstacle;
       V way = zero_vector<T, D>();
@@ -556,13 +556,13 @@ class SolidAt {
   // A way of height −1 above face i of a foot and 1 above the others; false where there is none.
   MPM_HD bool way_before(const V (&normal)[D], int i, const Foot<T, D>& foot, V& way) const {
     T gram[D][D], share[D];
-    for (int j = 0; j < foot.count; j++) {
+    MPM_LOOP for (int j = 0; j < foot.count; j++) {
       share[j] = T(i == j);
-      for (int l = 0; l < foot.count; l++) gram[j][l] = dot(normal[j], normal[l]);
+      MPM_LOOP for (int l = 0; l < foot.count; l++) gram[j][l] = dot(normal[j], normal[l]);
     }
     if (!solve_definite<T, D>(gram, share, foot.count)) return false;
     way = foot.step;
-    for (int j = 0; j < foot.count; j++) way = way + T(-2) * share[j] * normal[j];
+    MPM_LOOP for (int j = 0; j < foot.count; j++) way = way + T(-2) * share[j] * normal[j];
     return true;
   }
 
@@ -582,7 +582,7 @@ class SolidAt {
     const V there = at + seam_ * step;
     bool free = wanted && !faces_a_wall(at, step);
     uint64_t left = free ? poses_.s.near & ~but : 0;
-    while (any_of_warp(left != 0)) {
+    MPM_LOOP while (any_of_warp(left != 0)) {
       const T height = height_of(left != 0, lowest_bit(left), there, unused);
       free = free && (left == 0 || height > seam_ / 2);
       left = free ? left & (left - 1) : 0;
@@ -592,7 +592,7 @@ class SolidAt {
 
   MPM_HD bool faces_a_wall(const V& at, const V& step) const {
     constexpr double facing = 0.7;  // cosine above which a face looks at a wall
-    for (int face = 0; face < 2 * D; face++) {
+    MPM_LOOP for (int face = 0; face < 2 * D; face++) {
       if (a_.wall_kind[face] == Contact::open) continue;
       const T towards = face % 2 ? step[face / 2] : T(0) - step[face / 2];
       if (wall_height(a_, face, at) <= seam_ && towards > T(facing)) return true;
@@ -623,7 +623,7 @@ class SolidAt {
 
   MPM_HD int strictest(const Foot<T, D>& foot) const {
     int kind = int(Contact::separate);
-    for (int i = 0; i < foot.count; i++) {
+    MPM_LOOP for (int i = 0; i < foot.count; i++) {
       const int own = int(a_.kind[faces_.e[foot.member[i]].obstacle].contact);
       if (own < kind) kind = own;
     }
@@ -632,8 +632,8 @@ class SolidAt {
 
   MPM_HD T largest_friction(const Foot<T, D>& foot) const {
     T friction = T(0);
-    for (int i = 0; i < foot.count; i++)
-      friction = max(friction, poses_.s.row[faces_.e[foot.member[i]].obstacle].friction);
+    MPM_LOOP for (int i = 0; i < foot.count; i++) friction =
+        max(friction, poses_.s.row[faces_.e[foot.member[i]].obstacle].friction);
     return friction;
   }
 

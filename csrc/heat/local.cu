@@ -65,19 +65,35 @@ struct Count {
 
 // Values that are not negative are ordered like their bits, and NaN is above them.
 template <class T, int D>
-struct Largest {
-  HeatLargestArguments<T, D> a;
-
-  __device__ void operator()(int64_t p) const {
-    const double value = double(a.value.pointer[p * a.value.stride[0]]);
-    if (value <= 0) return;
-    const int64_t given = a.scene.pointer ? a.scene.pointer[p * a.scene.stride[0]] : 0;
-    const int64_t scene = given < 0 ? 0 : given < a.scenes ? given : a.scenes - 1;
+__global__ void __launch_bounds__(kThreads) largest_kernel(const __grid_constant__ HeatLargestArguments<T, D> a) {
+  grid_dependency_sync();
+  const auto raise = [&](int64_t scene, long long wanted) {
     auto* const bits = reinterpret_cast<long long*>(a.largest + scene * a.stride);
-    const long long wanted = value == value ? __double_as_longlong(value) : __double_as_longlong(NAN) & LLONG_MAX;
     if (*const_cast<volatile long long*>(bits) < wanted) atomicMax(bits, wanted);
+  };
+  int64_t scene = -1;
+  long long largest = 0;
+  const int64_t stride = int64_t(gridDim.x) * kThreads;
+  for (int64_t p = int64_t(blockIdx.x) * kThreads + threadIdx.x; p < a.particles; p += stride) {
+    const int64_t given = a.scene.pointer ? a.scene.pointer[p * a.scene.stride[0]] : 0;
+    const int64_t own = given < 0 ? 0 : given < a.scenes ? given : a.scenes - 1;
+    if (own != scene && largest > 0) raise(scene, largest);
+    if (own != scene) scene = own, largest = 0;
+    const double value = double(a.value.pointer[p * a.value.stride[0]]);
+    const long long bits = value == value ? __double_as_longlong(value) : LLONG_MAX;
+    if (bits > largest) largest = bits;
   }
-};
+  const int64_t first = __shfl_sync(~0u, scene, 0);  // a warp of one scene writes once
+  if (__all_sync(~0u, scene == first)) {
+#pragma unroll
+    for (int o = 16; o > 0; o /= 2) {
+      const long long other = __shfl_xor_sync(~0u, largest, o);
+      if (other > largest) largest = other;
+    }
+    if (threadIdx.x % 32 != 0) return;
+  }
+  if (largest > 0) raise(scene, largest);
+}
 
 template <class T, int D>
 struct Hold {
@@ -147,7 +163,10 @@ void heat_count(const HeatCountArguments<T, D>& a, Stream stream) {
 
 template <class T, int D>
 void heat_largest(const HeatLargestArguments<T, D>& a, Stream stream) {
-  for_each(a.particles, Largest<T, D>{a}, stream);
+  constexpr int particles_of_thread = 16;
+  if (a.particles == 0) return;
+  const int64_t blocks = (a.particles + kThreads * particles_of_thread - 1) / (kThreads * particles_of_thread);
+  launch_in_chain(largest_kernel<T, D>, unsigned(blocks), kThreads, 0, stream, a);
 }
 
 template <class T, int D>
