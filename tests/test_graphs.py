@@ -20,6 +20,7 @@ def heated(dim: int, device: str, **options) -> tuple[mpm.Step, mpm.State]:
     conductivity = mpm.Table([200.0, 500.0], [5.0, 5.0])  # The fused op reads no tables, so these steps are replayed.
     heat = mpm.Heat(grid, conductivity, specific_heat=800.0, boundaries=[plate])
     step = mpm.Step(grid, mpm.NeoHookean(E=1e4, nu=0.3), gravity=(0.0, -9.8, 0.0)[:dim], walls="slip", heat=heat)
+    step.to(device)
     state = blob(device, dim)
     return step, state.replace(temperature=300 + 40 * state.x[:, 0])
 

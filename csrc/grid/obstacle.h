@@ -36,8 +36,6 @@ struct ObstacleRow {
   static constexpr int width = 3 * D + 2 * angles + 2;
 };
 
-constexpr int kKnownNodes = 1 << 14;
-
 template <class T, int D>
 struct ContactArguments {
   Geometry<T, D> geometry;
@@ -70,10 +68,6 @@ struct ContactArguments {
   int64_t stride = 0, grad_stride = 0, mass_stride = 0;
   T* result =
       nullptr;  // rows [max_blocks * 4^D, 1 + D] as of the grid update, the first column zero or a mass' adjoint
-  // On CUDA, for a call of many substeps: surfaces that nodes meet where the obstacles rest, found once, in a table by
-  // node [kKnownNodes]; zero on entry, see `recall`.
-  unsigned long long* known_nodes = nullptr;
-  void* known = nullptr;  // MetSurfaces
   T* row_grad = nullptr;  // adjoint of the rows by each slot [max_blocks, obstacles, width], or null; backward only
 };
 
@@ -111,11 +105,11 @@ MPM_HD Matrix<T, 3> rotation_matrix(const T (&vector)[3], const T& factor) {
 
 // Whether a rotation turns nothing; that of dual numbers may have a derivative.
 template <class T, int N>
-MPM_HD bool is_at_rest(const T (&angle)[N]) {
-  bool rests = std::is_floating_point_v<T>;
+MPM_HD bool is_zero(const T (&angle)[N]) {
+  bool zero = std::is_floating_point_v<T>;
   if constexpr (std::is_floating_point_v<T>) MPM_UNROLL
-    for (int i = 0; i < N; i++) rests = rests && angle[i] == T(0);
-  return rests;
+    for (int i = 0; i < N; i++) zero = zero && angle[i] == T(0);
+  return zero;
 }
 
 // An obstacle at a time. S is the scalar of its parameters, T or a dual number.
@@ -166,8 +160,8 @@ MPM_HD ObstaclePose<S, D> obstacle_pose(const ContactArguments<T, D>& a, const O
   MPM_UNROLL for (int i = 0; i < D; i++)
     p.centre[i] = row.position[i] + row.velocity[i] * moved;
   // Most obstacles do not turn, and the matrices take longer than the rest of contact.
-  p.rotation = is_at_rest(row.rotation) ? identity<S, D>() : rotation_matrix(row.rotation, S(1));
-  if (!is_at_rest(row.angular_velocity)) p.rotation = rotation_matrix(row.angular_velocity, elapsed) * p.rotation;
+  p.rotation = is_zero(row.rotation) ? identity<S, D>() : rotation_matrix(row.rotation, S(1));
+  if (!is_zero(row.angular_velocity)) p.rotation = rotation_matrix(row.angular_velocity, elapsed) * p.rotation;
   return p;
 }
 

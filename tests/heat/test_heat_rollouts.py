@@ -466,7 +466,7 @@ def test_absent_particles_and_those_outside_keep_their_heat(dim, transfer, devic
     """Particles of no scene, and of a scene that moves out of the grid."""
     step, state = scene(dim, transfer=transfer, melts=True, scenes=2, device=device)
     step.walls = None
-    absent = torch.arange(len(state)) % 3 == 0
+    absent = torch.arange(len(state), device=device) % 3 == 0
     outside = torch.tensor([500.0, *[0.0] * (dim - 1)], dtype=torch.float64, device=device)
     state = state.replace(
         scene=state.scene.where(~absent, -1), v=torch.where(state.scene[:, None] == 1, outside, state.v)
