@@ -119,6 +119,15 @@ def test_choices_are_checked_before_the_first_scene(name):
 def test_particle_types_are_those_of_materials():
     with pytest.raises(SceneError, match=r"dataset\.particle_type\.jely: takes names of materials, jelly"):
         configuration(dataset__particle_type={"jely": 1})
+    with pytest.raises(SceneError, match=r"dataset\.particle_type\.jelly: takes 0 to 8 but for 3, the type of obst"):
+        configuration(dataset__particle_type={"jelly": 3})
+    assert configuration(dataset__particle_type={"jelly": 4}).dataset.particle_type == {"jelly": 4}
+
+
+def test_splits_have_files_of_their_own():
+    """Also on file systems that ignore the case of letters."""
+    with pytest.raises(SceneError, match="dataset.splits: train and Train differ in upper case alone"):
+        configuration(dataset__splits={"train": 1, "Train": 1})
 
 
 def test_good_choices_pass():

@@ -27,7 +27,7 @@ from __future__ import annotations
 import copy
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -45,6 +45,7 @@ from .content_checks import shape_problems, value_problems
 from .distribution import Words
 from .folder import MOST_SHARDS
 from .scene_words import number_problems
+from .statistics import BOUNDARY
 from .stress import MEASURES
 from .whole_files import LONGEST_NAME, is_name
 
@@ -276,6 +277,11 @@ def _checked(words: Words) -> Dataset:
     if unknown := [name for name in dataset.particle_type if name not in names]:
         expected = f"takes names of materials, {', '.join(names)}"
         raise SceneError([f"dataset.particle_type.{name}: {expected}" for name in unknown])
+    if bounds := [name for name, code in dataset.particle_type.items() if code == BOUNDARY]:
+        expected = f"takes 0 to 8 but for {BOUNDARY}, the type of obstacles, whose motion is given"
+        raise SceneError([f"dataset.particle_type.{name}: {expected}" for name in bounds])
+    if same := _names_of_one_file(dataset.splits):
+        raise SceneError([f"dataset.splits: {' and '.join(same)} differ in upper case alone, and would share files"])
     if "temperature" in dataset.fields and "heat" not in words:
         raise SceneError(["dataset.fields: temperature needs a [heat] table"])
     if "out_of_plane_stress" in dataset.fields and len(grid.lower) == 3:
@@ -286,6 +292,14 @@ def _checked(words: Words) -> Dataset:
     if not sum(dataset.splits.values()):
         raise SceneError([f"dataset.splits: has no scenes, got {dataset.splits}"])
     return dataset
+
+
+def _names_of_one_file(names: Iterable[str]) -> list[str]:
+    """Names that are one on file systems that ignore the case of letters; empty without such names."""
+    found: dict[str, list[str]] = {}
+    for name in names:
+        found.setdefault(name.casefold(), []).append(name)
+    return next((same for same in found.values() if len(same) > 1), [])
 
 
 def _hash(words: Words, folder: Path) -> str:
