@@ -322,3 +322,24 @@ def test_laws_that_errors_recommend_run(law):
         one.p2g2p(k, 1e-4)
     one.step.check(one.state)
     assert one.export_particle_v_to_torch()[:, 2].max() < -4e-3
+
+
+@pytest.mark.parametrize("key", ["substep_dt", "frame_dt"])
+@pytest.mark.parametrize("value", [0.0, -1e-4, float("nan"), float("inf")])
+def test_lengths_of_steps_and_frames_are_positive(tmp_path, key, value):
+    with pytest.raises(ValueError, match=f"{key} must be positive and finite"):
+        decode_param_json(written(tmp_path, {key: value}), "physgaussian")
+
+
+@pytest.mark.parametrize(
+    ("x", "volume", "message"),
+    [
+        ([[0.5, 0.5, 0.5], [float("nan"), 0.5, 0.5]], [1.0, 1.0], "tensor_x must be finite, got .* in row 1"),
+        ([[0.5, 0.5, 0.5], [0.4, 0.5, 0.5]], [0.0, 1.0], "tensor_volume must be positive and finite, got 0.0 in row 0"),
+        ([[0.5, 0.5, 0.5], [0.4, 0.5, 0.5]], [1.0, float("inf")], "tensor_volume must be positive and finite, got inf"),
+    ],
+)
+def test_bad_particles_are_errors(x, volume, message):
+    solver = MPM_Simulator_WARP(10)
+    with pytest.raises(ValueError, match=message):
+        solver.load_initial_data_from_torch(torch.tensor(x), torch.tensor(volume), n_grid=20)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import warnings
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -132,7 +133,7 @@ def decode_param_json(json_file: str | Path, dialect: str | None = None) -> tupl
 
     Raises:
         ValueError: for an unknown key, keys of several dialects, a Poisson's ratio outside [0, 0.5], or a box of
-            material parameters that lacks one.
+            material parameters that lacks one, and a length of a step or a frame that is not positive.
     """
     given = json.loads(read_text(json_file, "configuration"))
     if not isinstance(given, Mapping):
@@ -159,11 +160,19 @@ def decode_param_json(json_file: str | Path, dialect: str | None = None) -> tupl
         filling = {"n_grid": 4 * material["n_grid"], **FILLING}
         check_keys("particle_filling", preprocessing["particle_filling"], filling)
         preprocessing["particle_filling"] = filling | preprocessing["particle_filling"]
-    times, camera = part(TIME_OF.get(own.name, TIME)), part({**CAMERA, **CAMERA_OF.get(own.name, {})})
+    times, camera = _times(part(TIME_OF.get(own.name, TIME))), part({**CAMERA, **CAMERA_OF.get(own.name, {})})
     parts = material, given.get("boundary_conditions", {}), times, preprocessing, camera
     if own.name not in ("physflow", "motionphysics"):
         return parts
     return *parts, {"reduction": "sum"} | {name: given[name] for name in OPTIMISATION if name in given}
+
+
+def _times(times: dict[str, Any]) -> dict[str, Any]:
+    """Times of a configuration, with lengths of steps and frames that are positive."""
+    for name, value in times.items():
+        if name.endswith("_dt") and value is not None:
+            check_number(name, value, "positive and finite", lambda v: 0 < v < math.inf)
+    return times
 
 
 def _dialect(given: Mapping[str, Any], dialect: str | None) -> Dialect | None:

@@ -122,6 +122,9 @@ class MPM_Simulator_WARP(Viewed):
             tensor_volume: [P] [m³].
             tensor_cov: covariance of a Gaussian on each particle, six numbers xx xy xz yy yz zz: [P, 6] or [6 P].
             n_grid, grid_lim, device: as for the class.
+
+        Raises:
+            ValueError: for other shapes, positions that are not finite, and volumes that are not positive and finite.
         """
         if not isinstance(tensor_x, Tensor) or tensor_x.dim() != 2 or tensor_x.shape[1] != 3:
             raise ValueError(f"tensor_x must have shape [P, 3], got {shape_of(tensor_x)}")
@@ -132,6 +135,13 @@ class MPM_Simulator_WARP(Viewed):
         """Particles at rest at positions [P, 3] [m], with volumes [P] [m³]."""
         volume = volume.to(x)
         check_like("tensor_volume", volume, x, (len(x),), "[P]")
+        for name, given, good, expected in (
+            ("tensor_x", x, x.detach().isfinite().all(1), "finite"),
+            ("tensor_volume", volume, (volume.detach() > 0) & volume.detach().isfinite(), "positive and finite"),
+        ):
+            if not bool(good.all()):
+                row = int((~good).nonzero()[0])
+                raise ValueError(f"{name} must be {expected}, got {given[row].tolist()} in row {row}")
         motion = torch.zeros(len(x), 3, 3, dtype=x.dtype, device=x.device)
         self._state = State(
             x=x, v=torch.zeros_like(x), mass=0 * volume, volume=volume, C=motion, F=identity_deformation(x)
