@@ -18,6 +18,8 @@ class HeatSteps {
   Tensor status;                        // [B, kHeatStatusSize], float64
 
   static bool wanted(const SubstepsInputs& in) { return !in.heat.empty(); }
+  // Of the liquid fraction in the fields, or -1.
+  int liquid_column() const { return liquid_; }
 
   explicit HeatSteps(Substeps<T, D>& steps);
 

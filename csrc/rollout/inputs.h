@@ -61,6 +61,8 @@ namespace mpm {
   X(INTS, held_obstacles, held_obstacles)       \
   X(INTS, heat_terms, heat_terms)               \
   X(TENSORS, heat_boundaries, heat_boundaries)  \
+  X(INTS, thermal, thermal)                     \
+  X(TENSORS, tables, tables)                    \
   X(FLOATS, lattice, lattice_numbers)           \
   X(INTS, layout, lattice_layout)               \
   X(CHOICE, schedule, schedule)
@@ -120,26 +122,37 @@ inline std::vector<std::string> parts(const std::string& list, char mark) {
 struct LawCall {
   LawEntry* law;
   int material;
-  bool adds;  // to the stress of another law of the material
+  bool adds;   // to the stress of another law of the material
+  bool melts;  // the liquid of a material whose solid is the law before
   int64_t options;
   Tensors parameters, history;
   int64_t first_column;  // in the history of all laws
 };
 
-// Materials are separated by commas, and the laws of a material by '+'. `variables` are the numbers of history tensors,
-// which may be zero.
+// Materials are separated by commas, a solid and its liquid by '~', and the laws of either by '+'. `variables` are the
+// numbers of history tensors, which may be zero.
 inline std::vector<LawCall> law_calls(const std::string& names, const std::vector<int64_t>& options,
                                       const Tensors& parameters, const Tensors& history,
                                       const std::vector<int64_t>& variables, int64_t dim) {
   std::vector<LawCall> calls;
   for (const std::string& material : parts(names, ',')) {
     const int number = calls.empty() ? 0 : calls.back().material + 1;
-    for (const std::string& name : parts(material, '+')) {
-      const bool adds = !calls.empty() && calls.back().material == number;
-      calls.push_back({&law_of(name), number, adds, 0, {}, {}, 0});
-      STD_TORCH_CHECK(!adds || calls.back().law->info.additive, "a law after '+' must be one that is added, got ",
-                      name);
+    const std::vector<std::string> phases = parts(material, '~');
+    STD_TORCH_CHECK(phases.size() <= 2, "a material must have at most two phases, got ", material);
+    for (size_t phase = 0; phase < phases.size(); phase++) {
+      bool adds = false;
+      for (const std::string& name : parts(phases[phase], '+')) {
+        calls.push_back({&law_of(name), number, adds, phase > 0, 0, {}, {}, 0});
+        STD_TORCH_CHECK(!adds || calls.back().law->info.additive, "a law after '+' must be one that is added, got ",
+                        name);
+        adds = true;
+      }
     }
+    const size_t last = calls.size() - 1;
+    STD_TORCH_CHECK(!calls[last].melts || (!calls[last].adds && !calls[last - 1].adds &&
+                                           calls[last].law->info.field == Deformation::volume_ratio &&
+                                           calls[last - 1].law->info.field == Deformation::gradient),
+                    "a material must have one law of F and one of J where it melts, got ", material);
   }
   STD_TORCH_CHECK(options.size() == calls.size(), "options must have an entry per law, ", calls.size(), ", got ",
                   options.size());

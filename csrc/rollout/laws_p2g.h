@@ -29,6 +29,13 @@ struct ChunkRows {
 // Rows of integers.
 enum ChunkNumbers : int { kOriginRow, kSceneRow, kMaterialRow, kNumberRows };
 
+// Piecewise linear function of temperature, constant beyond its ends; of one knot: a number. None: absent.
+template <class T>
+struct TemperatureTable {
+  int knots = 0;
+  const T *temperature = nullptr, *value = nullptr;
+};
+
 template <class T, int D>
 struct ChunkLaw {
   void (*update)(const LawUpdateArguments<T, D>&, void* stream) = nullptr;
@@ -37,6 +44,10 @@ struct ChunkLaw {
   int material = 0;
   int history[kMostHistory], parameters[kMostParameters];  // their rows, -1 for none
   bool matrix[kMostHistory] = {};
+  TemperatureTable<T> tables[kMostParameters];  // of its parameters
+  TemperatureTable<T> expansion;                // of the material, with its first law
+  bool melts = false;                           // the liquid of a material whose solid is the law before
+  T coherency = 1;                              // with the liquid
 };
 
 // Displacement of all particles, after a P2G.
@@ -61,6 +72,8 @@ struct LawsP2GArguments {
   // Whether particle i of the index is written to place i; index and schedule are then rewritten.
   bool rearranges = false;
   int *index = nullptr, *schedule = nullptr;
+  // Rows that laws of temperature need: temperature, liquid fraction, F and J without expansion, stress of the liquid.
+  int temperature_row = -1, fraction_row = -1, elastic_row = -1, liquid_row = -1;
   T* copies = nullptr;  // [threads, copy_size]
   int64_t copy_size = 0;
   Whereabouts* whereabouts =

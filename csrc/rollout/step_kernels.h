@@ -26,6 +26,7 @@ struct Substeps {
   std::vector<LawCall> calls;
   FusedLawKernels<T, D> fused_kernels;  // of the first law
   bool plastic = false;                 // some law changes F
+  bool melts = false;                   // some material has a solid and a liquid law, which change F and J
   int64_t columns = 0;                  // of the history of all laws
   ActivateArguments<T, D> activation;
   std::vector<LawUpdateArguments<T, D>> laws;
@@ -373,7 +374,8 @@ void Substeps<T, D>::set_laws() {
     a.adds = call.adds;
     a.stress = field<T>(stress);
     laws.push_back(a);
-    plastic |= info.plastic;
+    melts |= call.melts;
+    plastic |= info.plastic || call.melts;
     columns = call.first_column + history_size(info, call.history, D);
   }
 }

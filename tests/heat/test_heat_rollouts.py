@@ -365,20 +365,93 @@ def test_other_heat_goes_step_by_step(reason):
         assert torch.equal(got.temperature, composed(step, state, 2, DT).temperature)
 
 
-@pytest.mark.parametrize("mixed", [False, True])
-def test_laws_that_read_the_temperature_go_step_by_step(mixed):
-    step, state = scene(2)
-    softens = mpm.NeoHookean(E=mpm.Table([-10.0, 20.0], [2e5, 1e4]), nu=0.3)
-    step.law = mpm.Mixture([mpm.NeoHookean(E=1e4, nu=0.3), softens]) if mixed else softens
-    if mixed:
-        state = state.replace(material=(torch.arange(len(state)) % 2).int())
+Table = mpm.Table
+SOFTENING = Table([-10.0, 2.0, 20.0], [2e5, 1e5, 1e4])
+WATER = {"bulk_modulus": 1e5, "viscosity": 5.0}
+THERMAL = {
+    "softening": lambda: mpm.NeoHookean(E=SOFTENING, nu=0.3),
+    "thinning": lambda: mpm.WeaklyCompressible(1e5, 7.0, Table([0.0, 5.0], [10.0, 1.0])),
+    "two tables": lambda: mpm.VonMises(E=SOFTENING, nu=0.3, yield_stress=Table([0.0, 6.0], [3e2, 1e2])),
+    "expansion": lambda: mpm.ThermalExpansion(mpm.NeoHookean(E=1e5, nu=0.3), 1e-3),
+    "expansion by a table": lambda: mpm.ThermalExpansion(mpm.Hencky(E=1e5, nu=0.3), Table([0.0, 5.0], [1e-3, 2e-3])),
+    "expansion and flow": lambda: mpm.ThermalExpansion(mpm.VonMises(E=SOFTENING, nu=0.3, yield_stress=1e2), 1e-3),
+    "expanding fluid": lambda: mpm.ThermalExpansion(mpm.WeaklyCompressible(1e5), 1e-3),
+    "expanding sand": lambda: mpm.ThermalExpansion(named("sand")["sand"](), 1e-3),
+    "melting": lambda: mpm.Melting(mpm.FixedCorotated(E=1e5, nu=0.3), mpm.WeaklyCompressible(**WATER)),
+    "melting and flow": lambda: mpm.Melting(named("von_mises")["von_mises"](), mpm.WeaklyCompressible(**WATER), 0.3),
+    "wax": lambda: mpm.ThermalExpansion(
+        mpm.Melting(mpm.NeoHookean(E=SOFTENING, nu=0.3), mpm.WeaklyCompressible(**WATER), 0.5), 1e-3
+    ),
+}
+
+
+def thermal(names, dim=3, dtype=torch.float64, scenes=1, **options):
+    """A scene of laws that read the temperature, of each or of a mixture."""
+    step, state = scene(dim, dtype, scenes, melts=True, **options)
+    laws = [THERMAL[name]() if name in THERMAL else named(name)[name]() for name in names]
+    step.law = laws[0] if len(laws) == 1 else mpm.Mixture(laws)
+    material = (torch.arange(len(state)) % len(laws)).int() if len(laws) > 1 else None
+    liquid = {"liquid": torch.rand(len(state), generator=torch.Generator().manual_seed(2)).to(dtype)}
+    return step, step.prepare(state.replace(F=None, J=None, material=material, extra=state.extra | liquid))
+
+
+@pytest.mark.parametrize("name", THERMAL)
+def test_laws_that_read_the_temperature(dim, name):
+    step, state = thermal([name], dim)
+    end = compare(step, state)
+    with torch.no_grad():
+        cold = composed(step, state.replace(temperature=state.temperature - 1.0), 12, DT)
+    assert relative_error(end.v, cold.v) > 1e-6
+    if "melting" in name or name == "wax":
+        assert 0 < float((end.extra["liquid"] > 0.5).double().mean()) < 1
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_random_laws_that_read_the_temperature(seed):
+    """Mixtures x transfers x kernels x batches x time steps x schedules, in both dtypes."""
+    r = random.Random(100 + seed)
+    scenes, dtype = r.choice((1, 3)), r.choice((torch.float32, torch.float64))
+    names = r.sample([*THERMAL, *LAWS], r.choice((1, 2, 4)))
+    step, state = thermal(
+        names, r.choice((2, 3)), dtype, scenes, kernel=r.choice(("quadratic", "cubic")),
+        transfer=r.choice(TRANSFERS), flip=r.choice((0.0, 0.4)), deterministic=r.choice((True, False)),
+    )  # fmt: skip
+    dt = torch.linspace(1, 2, scenes, dtype=dtype) * DT if r.random() < 0.5 else DT
+    schedule = r.choice((None, "per_step", "sorted_cpu"))
+    compare(step, state, r.choice((2, 9, 25)), dt, schedule, 1e-8 if dtype == torch.float64 else 3e-3)
+
+
+def test_one_particle_reads_its_temperature():
+    step, state = thermal(["softening"])
+    compare(step, step.prepare(state.select(torch.tensor([5]))))
+
+
+def test_temperatures_beyond_the_knots():
+    """And at knots; a law of one temperature is that of numbers."""
+    ends = []
+    for E in (Table([100.0, 101.0], [1e5, 2e5]), Table([-3.0, -2.0], [2e5, 1e5]), 1e5):
+        step, state = thermal(["softening"])
+        step.law = mpm.NeoHookean(E=E, nu=0.3)
+        ends.append(compare(step, state).v)
+    for end in ends[:2]:
+        torch.testing.assert_close(end, ends[2], rtol=0, atol=1e-12)
+
+
+UNSUPPORTED = {
+    "the heat has no melting point": lambda s: setattr(s, "heat", mpm.Heat(s.grid, 2000.0, 100.0)),
+    "an expansion is neither one number nor a table": lambda s: setattr(s.law, "coefficient", lambda theta: 0 * theta),
+    "a parameter of the law is a function": lambda s: setattr(s.law.law.solid, "nu", Table([0.0, 5.0], [0.2, 0.4])),
+    "is more than a compiled law": lambda s: setattr(s.law.law, "solid", named("custom")["custom"]()),
+}
+
+
+@pytest.mark.parametrize("reason", UNSUPPORTED)
+def test_other_laws_that_read_the_temperature_go_step_by_step(reason):
+    step, state = thermal(["wax"], 2)
+    UNSUPPORTED[reason](step)
     with torch.no_grad():
         plan = plan_rollout(step, state, 10, DT)
-        assert plan.executor == "loop" and "a parameter of the law is a function" in plan.reasons["fused"]
-        got = mpm.rollout(step, state, 10, DT)
-        assert torch.equal(got.v, composed(step, state, 10, DT).v)
-        alone = mpm.Step(step.grid, step.law, step.gravity)  # the temperature stays
-        assert plan_rollout(alone, state, 10, DT).executor == "fused"
+    assert plan.executor == "loop" and reason in plan.reasons["fused"]
 
 
 @pytest.mark.parametrize("of", ["temperature", "v", "conductivity"])

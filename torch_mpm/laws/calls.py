@@ -11,6 +11,7 @@ from .compiled import CompiledLaw
 from .material import Material
 from .mixture import Mixture
 from .parameters import Overlay
+from .thermal_calls import COHERENCY, is_thermal, phases_of, tables_of_expansion, tables_of_parameters
 
 
 class LawCalls(NamedTuple):
@@ -30,6 +31,11 @@ class LawCalls(NamedTuple):
     """Options of each material."""
     material: Tensor | None
     """Material of each particle; None for a single one."""
+    thermal: list[int]
+    """What depends on the temperature: a law, a parameter of it, `EXPANSION` or `COHERENCY`, and a table, each by its
+    number."""
+    tables: list[Tensor]
+    """Temperatures and values [2, K]; of one temperature: a number."""
 
 
 def laws_of(law: Material) -> list[Material]:
@@ -42,10 +48,11 @@ def passive(law: Material) -> Material:
     return law.law if type(law) is Active else law
 
 
-def law_calls(law: Material, state: Any, dt: float | Tensor | None = None) -> LawCalls:
+def law_calls(law: Material, state: Any, dt: float | Tensor | None = None, heated: bool = False) -> LawCalls:
     """Calls of compiled laws for a state and a time step [s]; some may be `Active`.
 
-    Without `dt` rate-dependent laws use that of the state.
+    Without `dt` rate-dependent laws use that of the state. Where a call is `heated`, its temperatures change, laws may
+    expand and melt, and `why_not_thermal` must be None for those that do or that have functions.
 
     Raises:
         ValueError: where the state has no material, or one that the mixture does not have, as `Mixture.check_material`.
@@ -55,15 +62,40 @@ def law_calls(law: Material, state: Any, dt: float | Tensor | None = None) -> La
     names: list[str] = []
     each: list[tuple[int, list[Tensor], list[Tensor]]] = []  # Per law: options, parameters, history.
     history_names: list[list[str]] = []
-    for part in laws:
-        own: CompiledLaw = passive(part)  # type: ignore[assignment]
+    thermal: list[int] = []
+    tables: list[Tensor] = []
+
+    def add(own: CompiledLaw) -> str:
         with_dt: Any = state if dt is None or not own.rate_dependent else Overlay(state, dt=dt)
-        names.append(own._name(state))
         each.append((own.option_bits(), own._arguments(with_dt)[1], own._history(state)))
-        history_names.append(own.history_names())
-        if isinstance(part, Active):
-            names[-1] += f"+{FIBRE}"
-            each.append((0, part.fibre_parameters(state), []))
+        return own._name(state)
+
+    def add_tables(found: list[tuple[int, Tensor]] | None) -> None:
+        assert found is not None
+        for what, table in found:
+            thermal.extend((len(each) - 1, what, len(tables)))
+            tables.append(table.to(state.x).contiguous())
+
+    for part in laws:
+        if not heated or not is_thermal(part):
+            own: CompiledLaw = passive(part)  # type: ignore[assignment]
+            names.append(add(own))
+            history_names.append(own.history_names())
+            if isinstance(part, Active):
+                names[-1] += f"+{FIBRE}"
+                each.append((0, part.fibre_parameters(state), []))
+            continue
+        phases = phases_of(part)
+        solid: CompiledLaw = phases.solid  # type: ignore[assignment]
+        liquid: CompiledLaw | None = phases.liquid  # type: ignore[assignment]
+        names.append(add(solid))
+        add_tables(tables_of_parameters(solid, state.x.shape[1]))
+        add_tables(tables_of_expansion(phases.expansion))
+        history_names.append(solid.history_names())
+        if liquid is not None:
+            names[-1] += f"~{add(liquid)}"
+            add_tables(tables_of_parameters(liquid, state.x.shape[1]))
+            add_tables([(COHERENCY, state.x.new_tensor([[0.0], [phases.coherency]]))])
     return LawCalls(
         ",".join(names),
         [options for options, _, _ in each],
@@ -72,4 +104,6 @@ def law_calls(law: Material, state: Any, dt: float | Tensor | None = None) -> La
         [variable for _, _, history in each for variable in history],
         history_names,
         material if len(laws) > 1 else None,
+        thermal,
+        tables,
     )

@@ -4,7 +4,7 @@
         laws, options, parameters, variables, n, dt, apic, flip, wants_C, stress_form, gravity, wall_kind, wall_plane,
         wall_friction, obstacles, data, shape, sizes, contact, obstacle_scene, start, end, time, scenes,
         max_blocks, grows, resident, records, impulse, scene_dt, scene_time, heat, heat_options, heat_scalars,
-        held_obstacles, heat_terms, heat_boundaries, lattice, layout, schedule=-1)
+        held_obstacles, heat_terms, heat_boundaries, thermal, tables, lattice, layout, schedule=-1)
         -> (x, v, C, F, J, history, status, impulse, time, residual, heat, heat_status, record)
 
 `torch_mpm.substeps_arguments(step, state, n, dt)` returns the arguments; docs/training.md has an example.
@@ -35,6 +35,10 @@ constant of Stefan and Boltzmann; and ambient temperature), and the power of a s
 [0]. The result `heat` [P, m] has temperature, gradient and liquid fraction in its first columns, `heat_status` [B, 3]
 the number of solves that missed the tolerance, their largest residual [K], and the largest diffusion number of
 particles whose liquid fraction changed.
+
+Where temperatures change, a name in `laws` may be that of a solid and, after a ~, of its liquid, as `Melting` has them.
+`thermal` are records of three numbers: a law, one of its parameters or -1 for the linear expansion of its material or
+-2 for the coherency of a liquid, and one of the `tables` [2, K], increasing temperatures and values; K = 1 is a number.
 
 `schedule` is the number of a schedule in the order of csrc/rollout/plan.h; -1 chooses the fastest. A schedule that does
 not support the call is an error with the reason; its sums may round differently.
@@ -187,6 +191,7 @@ def _backward(ctx: Any, *grads: Any) -> Any:
     adjoints = interruptible(dispatch, op, *grads[:6], by_impulse, needs, record, *arguments)
     found = dict(zip(_ADJOINTS, adjoints, strict=True)) | {"impulse": grads[7], "heat": [None] * len(given["heat"])}
     found["heat_boundaries"] = [None] * len(given["heat_boundaries"])
+    found["tables"] = [None] * len(given["tables"])
     found["history"] = _of_history(found["history"], history, wanted["history"])
     found["parameters"] = _of_parameters(found["parameters"], parameters, wanted["parameters"], given["scene"])
     by_dt = found.pop("dt")
@@ -200,7 +205,7 @@ def _backward(ctx: Any, *grads: Any) -> Any:
         found["gravity"] = dt * change
         if wants_dt:
             found["scene_dt"] = found["scene_dt"] + given["dt"] * (given["gravity"] * change).sum(1)
-    lists = ("history", "parameters", "heat", "heat_boundaries")
+    lists = ("history", "parameters", "heat", "heat_boundaries", "tables")
     return tuple(found.get(name) if name in lists or wanted[name] is True else None for name in _SCHEMA)
 
 

@@ -15,6 +15,7 @@ from ..laws import CompiledLaw
 from ..laws.active import Active
 from ..laws.calls import laws_of, passive
 from ..laws.parameters import tensors_in
+from ..laws.thermal_calls import laws_in
 from ..ops.obstacle_tables import numbers_of_a_step, path_requires_grad
 from ..state.state import ROLES, State
 from ..step.clocks import StepTimes, requires_grad
@@ -87,7 +88,7 @@ def facts_of(steps: Steps, state: State, stores_all: bool = False) -> Facts:
         isinstance(dt, Tensor) or state.scene_time is not None,
         state.scene is not None,
         state.ids is not None,
-        sum([2 if isinstance(part, Active) else 1 for part in laws]),
+        sum([2 if isinstance(part, Active) else len(laws_in(part)) for part in laws]),
         len(laws) > 1,
         False,
         not x.is_cuda or _is_uniform(laws[0]),

@@ -139,7 +139,7 @@ def _arguments(
     times = StepTimes.of(state, n, dt, grid.scenes) if boundaries and follows_paths(step) else None
     pool = grid.pool(state.x, state.scene)
     law.check_parameters(len(state), grid.scenes)
-    calls = law_calls(law, state, dt)
+    calls = law_calls(law, state, dt, step.heat is not None)
     apic = step.transfer == "apic"
     wants_C = step._keeps_C or step.heat is not None
     table, *others = obstacle_arguments(boundaries, state.x, grid.scenes, times)
@@ -156,7 +156,8 @@ def _arguments(
         *(table, *others),
         *(0.0 if scene_time is not None else float(state.time), grid.scenes),
         *(pool if blocks is None else max(pool, blocks), grid.grows, not with_gradient, with_gradient and records),
-        *(state.impulse, scene_dt, scene_time, *heat_arguments(step, state), *grid.packed),
+        *(state.impulse, scene_dt, scene_time, *heat_arguments(step, state)),
+        *(calls.thermal, calls.tables, *grid.packed),
         -1 if schedule is None else SCHEDULES.index(schedule),
     )
     return arguments, calls.history_names

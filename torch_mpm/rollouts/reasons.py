@@ -24,6 +24,7 @@ from ..laws import CompiledLaw
 from ..laws.calls import laws_of, passive
 from ..laws.custom import CustomLaw
 from ..laws.parameters import has_hooks, modules_in
+from ..laws.thermal_calls import is_thermal, laws_in, why_not_thermal
 from ..ops.contact import MAX_OBSTACLES, fusible
 from ..state.state import State, tensors_of
 from ..step.clocks import requires_grad
@@ -59,12 +60,13 @@ def why_not_fused(step: Any, state: State, n: int, dt: float | Tensor) -> str | 
         return "it calls on_particles"
     if step._flip_share and state.impulse is not None and has_mirrors(step):
         return "FLIP keeps a share of the impulses on mirrors"
-    laws = [passive(part) for part in laws_of(law)]
+    materials = [passive(part) for part in laws_of(law)]
+    laws = materials if step.heat is None else [part for material in materials for part in laws_in(material)]
     for part in laws:
         if not isinstance(part, CompiledLaw) or not part.is_all_of_its_update() or type(part).forward is not _FORWARD:
             return f"{type(part).__name__} is more than a compiled law"
-    if step.heat is not None and any([part.has_functions for part in laws]):
-        return "a parameter of the law is a function, and its heat changes the temperature"
+    if step.heat is not None and (reason := _why_not_heated(step, x)) is not None:
+        return reason
     if any([has_hooks(module) for module in (step, *modules_in(law))]):
         return "there are hooks"
     if not all([isinstance(b, Obstacle) and fusible(b, 0.0, paths=True) for b in boundaries.entries]):
@@ -77,6 +79,18 @@ def why_not_fused(step: Any, state: State, n: int, dt: float | Tensor) -> str | 
 
 
 _FORWARD = CompiledLaw.forward
+
+
+def _why_not_heated(step: Step, x: Tensor) -> str | None:
+    """Reason why the fused op does not compute the laws of a step whose heat changes the temperature."""
+    assert step.heat is not None
+    laws = laws_of(step.law)
+    thermal = [law for law in laws if is_thermal(passive(law))]
+    if any([law is not passive(law) for law in thermal]):
+        return "a law with muscles reads the temperature"
+    if thermal and x.is_cuda:
+        return "a law reads the temperature, on a CUDA device"
+    return next(filter(None, (why_not_thermal(law, x.shape[1], step.heat.melts) for law in thermal)), None)
 
 
 def _why_not_eager(x: Tensor) -> str | None:

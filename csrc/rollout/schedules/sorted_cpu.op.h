@@ -49,6 +49,14 @@ class SortedCpu {
 
   double farthest() const;
   void find_laws();
+  void find_thermal();
+  TemperatureTable<T> table(int64_t number) const;
+  bool has_table(int64_t law, int parameter) const {
+    for (size_t r = 0; r + 2 < in_.thermal.size(); r += 3)
+      if (in_.thermal[r] == law && in_.thermal[r + 1] == parameter) return true;
+    return false;
+  }
+  void read_column(int column, int row);
   void keep_velocities();
   bool begin(const int* status_before, int* status, int64_t following);
   void run_substep(const int* status_before, int* status);
@@ -71,7 +79,7 @@ class SortedCpu {
     const bool gradient = has(in_.F), ratio = has(in_.J);
     visit(x, -1, false, false);
     if (gradient) visit(F, R::F, reads_F_, s_.plastic);
-    if (ratio) visit(J, R::J, reads_J_, false);
+    if (ratio) visit(J, R::J, reads_J_, s_.melts);
     if (has(in_.residual)) visit(residual, -1, false, false);
     visit(mass_, -1, false, false);
     visit(volume_, -1, false, false);
@@ -97,6 +105,7 @@ class SortedCpu {
   std::vector<const T*> prefetched_;
   LawsP2GArguments<T, D> a_;
   Tensor copies_;
+  int copied_rows_ = 0;
   bool reads_F_ = false, reads_J_ = false, viscous_ = false, rearranged_ = false;
   bool owned_ = false, moved_ = true;  // whether the fields are in buffers; whether some have moved since the last step
   int64_t breaks_ = 0, all_breaks_ = 0;  // of this substep, and since the last reorder
@@ -136,7 +145,7 @@ SortedCpu<T, D>::SortedCpu(Substeps<T, D>& steps, const Tensor& packed_history, 
   a_.laws = laws_.data();
   a_.law_count = int(laws_.size());
   a_.material_count = s_.calls.back().material + 1;
-  a_.copy_size = (R::rest + int64_t(s_.columns + parameters_.size())) * kCopyLine;
+  a_.copy_size = int64_t(copied_rows_) * kCopyLine;
   copies_ = empty(like, {cpu::thread_count(), a_.copy_size});
   a_.copies = static_cast<T*>(copies_.data_ptr());
 }
@@ -175,12 +184,73 @@ void SortedCpu<T, D>::find_laws() {
     for (int i = 0; i < kMostParameters; i++) {
       const Parameter<T>& p = law.arguments.law.parameters[i];
       law.parameters[i] = -1;
-      if (!p.pointer || p.stride == 0 || p.scenes > 0) continue;
+      if (has_table(int64_t(k), i) || !p.pointer || p.stride == 0 || p.scenes > 0) continue;
       law.parameters[i] = parameter_row(parameters_.size());
       parameters_.push_back({in_.x, {p.pointer, {p.stride, 0, 0}}, {in_.x.size(0)}});
     }
+    law.melts = call.melts;
     laws_.push_back(law);
   }
+  copied_rows_ = R::rest + int(s_.columns + parameters_.size());
+  find_thermal();
+}
+
+// What laws need of the temperature, and the rows for it. Records of the call: a law, then the number of a parameter,
+// −1 for the expansion of its material or −2 for its coherency, and the number of a table.
+template <class T, int D>
+void SortedCpu<T, D>::find_thermal() {
+  STD_TORCH_CHECK(in_.thermal.size() % 3 == 0, "thermal must have records of 3 numbers, got ", in_.thermal.size());
+  bool reads_temperature = false, expands = false;
+  for (size_t r = 0; r < in_.thermal.size(); r += 3) {
+    const int64_t k = in_.thermal[r], what = in_.thermal[r + 1];
+    STD_TORCH_CHECK(k >= 0 && k < int64_t(laws_.size()), "thermal must name laws 0 to ", laws_.size() - 1, ", got ", k);
+    ChunkLaw<T, D>& law = laws_[size_t(k)];
+    STD_TORCH_CHECK(what >= -2 && what < int64_t(s_.calls[size_t(k)].parameters.size()),
+                    "thermal must name parameters of a law, got ", what);
+    const TemperatureTable<T> own = table(in_.thermal[r + 2]);
+    if (what == -2) {
+      law.coherency = own.value[0];
+      continue;
+    }
+    reads_temperature = true;
+    expands |= what == -1;
+    (what == -1 ? law.expansion : law.tables[what]) = own;
+    if (what >= 0) law.parameters[what] = copied_rows_++;
+  }
+  STD_TORCH_CHECK((!reads_temperature && !s_.melts) || heat, "laws of temperature need heat");
+  STD_TORCH_CHECK(!s_.melts || heat->liquid_column() >= 0, "a material that melts needs heat with a melting point");
+  if (reads_temperature) a_.temperature_row = copied_rows_++;
+  if (s_.melts) a_.fraction_row = copied_rows_++;
+  if (s_.melts || expands) a_.elastic_row = copied_rows_, copied_rows_ += D * D + 1;
+  if (s_.melts) a_.liquid_row = copied_rows_, copied_rows_ += D * D;
+}
+
+template <class T, int D>
+TemperatureTable<T> SortedCpu<T, D>::table(int64_t number) const {
+  STD_TORCH_CHECK(number >= 0 && number < int64_t(in_.tables.size()), "tables must have an entry ", number, ", got ",
+                  in_.tables.size());
+  const Tensor& t = in_.tables[size_t(number)];
+  const int64_t knots = t.dim() == 2 ? t.size(1) : 0;
+  STD_TORCH_CHECK(knots > 0, "tables must have shape [2, K], got ", shape_of(t));
+  check_shape(t, element("tables", int(number)).c_str(), {2, knots});
+  check_like(t, element("tables", int(number)).c_str(), in_.x);
+  STD_TORCH_CHECK(t.is_contiguous(), "tables must be contiguous");
+  const T* const values = static_cast<const T*>(t.data_ptr());
+  return {int(knots), values, values + knots};
+}
+
+// Copies a column of heat to a row.
+template <class T, int D>
+void SortedCpu<T, D>::read_column(int column, int row) {
+  if (row < 0) return;
+  const Field<const T>& fields = heat->fields.now();
+  const T* const from = fields.pointer + column * fields.stride[1];
+  for (ParticleRow<T>& r : rows_)
+    if (r.from == from) {
+      r.row = row;
+      return;
+    }
+  rows_.push_back({from, fields.stride[0], nullptr, row});
 }
 
 // A break in the order of the particles costs every substep about as much as a particle; reordering a particle costs a
@@ -313,6 +383,8 @@ void SortedCpu<T, D>::find_rows(bool rearranges) {
   for_fields([&](OwnField<T>& f, int row, bool read, bool changes) {
     if (read || rearranges) f.rows(rows_, row, changes || rearranges, rearranges);
   });
+  read_column(0, a_.temperature_row);
+  if (a_.fraction_row >= 0) read_column(heat->liquid_column(), a_.fraction_row);
   if (viscous_ && C.now().pointer) C.rows(rows_, R::C, false, false);
   if (rearranges && s_.flips()) kept_.rows(rows_, -1, true, true);
   if (rearranges) origin_.rows(numbers_, kOriginRow, true, true);
