@@ -126,7 +126,7 @@ def test_particle_types_are_those_of_materials():
 
 def test_splits_have_files_of_their_own():
     """Also on file systems that ignore the case of letters."""
-    with pytest.raises(SceneError, match="dataset.splits: train and Train differ in upper case alone"):
+    with pytest.raises(SceneError, match=r"dataset\.splits: train and Train differ in upper case alone"):
         configuration(dataset__splits={"train": 1, "Train": 1})
 
 

@@ -80,7 +80,7 @@ def tables_of_parameters(law: CompiledLaw, dim: int) -> Tables | None:
     knots = torch.cat([f.temperature.double().cpu() for f in functions]).unique()
     middles = (knots[1:] + knots[:-1]) / 2
     points = torch.cat([knots, middles])
-    rows = Overlay(
+    rows: Any = Overlay(
         None, temperature=points, x=points.new_zeros(len(points), dim), F=points.new_zeros(len(points), dim, dim),
         J=points, ids=None, scene=None, scenes=1, dt=0.0,
     )  # fmt: skip

@@ -70,10 +70,11 @@ def rollout(
             rollout makes it.
 
     A `Step` of compiled laws without user functions computes all steps in one op, or in a few calls of it. With
-    heat it does so without gradients, if the boundaries of the heat are held obstacles of the step, sources, or terms
-    of the free surface with constant numbers, and on the CPU also if laws expand or melt, or have a `Table` of the
-    temperature among their parameters. `Step.explain` returns the executor, the schedule and the reasons. The results are those of single steps. On CUDA they are bitwise equal, with two exceptions,
-    which round differently, as all steps on a CPU do:
+    heat it does so without gradients, if the boundaries of the heat are held obstacles of the step, sources, or
+    terms of the free surface with constant numbers, and on the CPU also if laws expand or melt, or have a `Table`
+    of the temperature among their parameters. `Step.explain` returns the executor, the schedule and the reasons.
+    The results are those of single steps. On CUDA they are bitwise equal, with two exceptions, which round
+    differently, as all steps on a CPU do:
 
     - float32 without gradients;
     - many unsorted particles (`state.ids` is None): for 64 steps or more they are sorted first, and restored to their
