@@ -405,14 +405,8 @@ def raw_arguments(device: str) -> list:
         False,
         False,
         impulse,
-        None,
-        None,
-        [],
-        [],
-        [],
-        [],
-        [],
-        [],
+        *(None, None),
+        *([], [], [], [], [], [], [], []),  # no heat
         *grid.packed,
     )
     return [*particles, [state.mass * 0], scene, None, material, None, *laws, *how, *rest]

@@ -543,7 +543,7 @@ def test_the_raw_op(device):
         None,
         None,
         None,
-        *([], [], [], [], [], []),  # no heat
+        *([], [], [], [], [], [], [], []),  # no heat
         *grid.packed,
     )
     call = (*particles, *law, 2, 1e-4, True, 0.0, True, 0, *rest)

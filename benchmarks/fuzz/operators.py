@@ -223,11 +223,12 @@ class _Calls:
         how = ([ones] * sum(counts), [0, 1, 0], 3, 1e-3, True, 0.0, True, 0, self.normal(2, D), *self.walls)
         impulse = self.normal(2, 6 + 2 * D, D + (1 if D == 2 else 3)).double()
         clocks = self.dt, self.uniform(2).double()
-        nothing = ([], [], [], [], [], [])
+        nothing = ([], [], [], [], [], [], [], [])
         end = (*self.obstacles, 0.1, 2, 40, True, False, False, impulse, *clocks, *nothing)
         heat = [self.uniform(P), ones, ones, self.uniform(P), ones, 1 + self.uniform(2), self.normal(P, D)]
         bounds = [self.normal(2, 2), self.uniform(3, 2, 2), self.uniform(P)]
-        conducts = (heat, [0, 9, 1], [1e-3, 273.0], [1, 0], [0, 1, 2], bounds)
+        table = torch.stack([torch.arange(3, dtype=self.dtype), 1 + self.uniform(3)])
+        conducts = (heat, [0, 9, 1], [1e-3, 273.0], [1, 0], [0, 1, 2], bounds, [0, 1, 0], [table])
         hot = (*self.obstacles, 0.1, 2, 40, True, True, False, None, *clocks, *conducts)
         look = (*fields[:5], self.F, *self.uniform(4, P), self.scene, 50.0, 2.0, True, 0.1, self.lattice.upper, 2)
         start = (*fields, 0.5 + self.uniform(P), None, [self.uniform(P)], *who, *laws, *how)
