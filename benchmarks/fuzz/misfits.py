@@ -57,6 +57,7 @@ FLAGS = (
     "energy",
     "gradient",
     "grows",
+    "choose",
     "moment",
     "projected",
     "records",
@@ -64,8 +65,9 @@ FLAGS = (
     "volumetric",
     "wants_.*",
 )
-NUMBERS = "time|dt|start|end|moment_scale|numbers|adjoint_tolerance|.*tolerance|bound|kept|reach|upper|flip"
+NUMBERS = "time|dt|cfl|longest|start|end|moment_scale|numbers|adjoint_tolerance|.*tolerance|bound|kept|reach|upper|flip"
 REAL = r"torch\.(float16|float64|int64|bool)"
+SHAPES = "(Sphere|Plane|Box|Capsule|SDF|Revolved)"
 FITTING: tuple[tuple[str, str, str, str], ...] = (
     (".*", OPTIONAL, "None", "optional"),
     ("ops[.].*", ".*", "on meta", "an argument on meta makes a fake call"),
@@ -113,7 +115,11 @@ FITTING: tuple[tuple[str, str, str, str], ...] = (
     ("grid_update|wall_impulses", "gravity", "one dimension more", "[B, D] of one scene"),
     ("ops[.]implicit_cg", "images", "axis 0", "any number of images"),
     ("PerMaterial", "values", ".*", "any values of any number; a law or a Heat that gets them checks them"),
-    ("(Sphere|Plane|Box|Capsule|SDF|Revolved)", "radius|angular_velocity", "a list", "a list of one scene"),
+    (SHAPES, "friction|radius|angular_velocity", "a list", "a list of one scene"),
+    (SHAPES, ".*", "nested", "vectors of one scene"),
+    (".* of a batch", "position|velocity|normal|size|half_axis|gravity", "as a list", "lists are values too"),
+    ("Step", "gravity", "nested", "vectors of one scene"),
+    ("ops[.]segment_clock", "rate", "None", "optional"),
 )
 """Patterns of a callable, an argument and a change that may be accepted, and the reason."""
 

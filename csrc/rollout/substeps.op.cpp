@@ -131,7 +131,8 @@ Results run_steps(const SubstepsInputs& in, backend::Stream stream) {
 Results run(const SubstepsInputs& in) {
   const Tensor& x = in.x;
   check_positions(x);
-  STD_TORCH_CHECK(in.heat.empty() || (!in.records && in.resident), "heat is computed without gradients");
+  STD_TORCH_CHECK(in.heat.empty() || (!in.records && in.resident),
+                  "heat is computed without gradients: records must be false, and resident true");
   STD_TORCH_CHECK(x.is_cpu() || (in.thermal.empty() && in.laws.find('~') == std::string::npos),
                   "laws of temperature are computed on the CPU");
   const DeviceScope device(x);
