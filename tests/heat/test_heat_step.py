@@ -237,6 +237,36 @@ def test_paused_scene_with_plastic_heating(device):
     assert bool(by_F.isfinite().all() and by_dt.isfinite().all()) and float(by_F[still].abs().max()) == 0
 
 
+@pytest.mark.parametrize("assigned", ["share", "law", "heat"])
+def test_plastic_heating_assigned_later(assigned):
+    """Equals that of a step made so."""
+    _, both, _ = paused_batch("cpu")
+    F = torch.eye(2, dtype=FLOAT).repeat(len(both), 1, 1)
+    F[:, 0, 1] = 0.3
+    state = both.replace(F=F, material=torch.zeros(len(both), dtype=torch.int32))
+    grid = grid_around(n=4, scenes=2)
+
+    def laws() -> mpm.Material:
+        return mpm.Mixture([mpm.VonMises(E=1e3, nu=0.3, yield_stress=1.0), mpm.NeoHookean(E=1e3, nu=0.3)])
+
+    def made(share: float, law: mpm.Material) -> mpm.Step:
+        return mpm.Step(grid, law, heat=mpm.Heat(grid, 1.0, 1.0, plastic_heating=share))
+
+    expected = made(0.9, laws())(state, 1e-3).temperature
+    if assigned == "law":
+        step = made(0.9, mpm.NeoHookean(E=1e3, nu=0.3))
+        step.law = laws()
+    else:
+        step = made(0.0, laws())
+    if assigned == "share":
+        step.heat.plastic_heating = 0.9
+    if assigned == "heat":
+        step.heat = mpm.Heat(grid, 1.0, 1.0, plastic_heating=0.9)
+    found = step(step.prepare(state), 1e-3).temperature
+    assert float((found - both.temperature).abs().max()) > 0
+    torch.testing.assert_close(found, expected)
+
+
 @pytest.mark.parametrize("method", ["cg", "multigrid"])
 def test_solve_of_a_paused_scene_has_gradients(method):
     """`heat_cg` alone: the increment of a scene with dt = 0 is zero for any data."""

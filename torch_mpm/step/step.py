@@ -157,11 +157,17 @@ class Step(TensorModule):
         """Pass settings of the step to its law, and settings of the law to the step."""
         parts = list(self.law.modules())
         self._rate_dependent = any(getattr(part, "rate_dependent", False) for part in parts)
+        self._let_dissipate()
+
+    def _let_dissipate(self) -> None:
+        """Let the law return what it dissipates, where a share of that becomes heat: also if the share was assigned
+        after the step was made."""
         heat = getattr(self, "heat", None)
-        if heat is not None and heat.plastic_heating:
-            for part in parts:
-                if isinstance(part, Material):
-                    part.dissipation = True
+        if heat is None or not heat.plastic_heating:
+            return
+        for part in self.law.modules():
+            if isinstance(part, Material) and not part.dissipation:
+                part.dissipation = True
 
     def register_full_backward_hook(self, *arguments: Any, **options: Any) -> Any:
         """Raises: PyTorch's hooks would never be called for a `State`.
@@ -215,6 +221,7 @@ class Step(TensorModule):
         self._error_status.begin(state, grid.scenes)
         blocks = self._error_status.activate(grid, state.x, scene, state.ids)
         form, affine = self.stress_form, state.C if self.transfer == "apic" else None
+        self._let_dissipate()
         fields, stress = law(Overlay(state, dt=dt) if self._rate_dependent else state)
         stress = from_half(stress, state.x)
         dissipated = fields.pop("dissipated", None)
