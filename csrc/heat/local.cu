@@ -9,28 +9,29 @@ namespace {
 
 constexpr int kThreads = 256;
 
-// Calls work(i) for i < count, one per thread.
-template <class Work>
-__global__ void __launch_bounds__(kThreads) each_kernel(const __grid_constant__ Work work, int64_t count) {
+// Calls work(a, i) for i < count, one per thread.
+template <auto work, class Arguments>
+__global__ void __launch_bounds__(kThreads) each_kernel(const __grid_constant__ Arguments a, int64_t count) {
   grid_dependency_sync();
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-  if (i < count) work(i);
+  if (i < count) work(a, i);
 }
 
-template <class Work>
-void for_each(int64_t count, const Work& work, Stream stream) {
+template <auto work, class Arguments>
+void for_each(int64_t count, const Arguments& a, Stream stream) {
   if (count == 0) return;
-  launch_in_chain(each_kernel<Work>, unsigned((count + kThreads - 1) / kThreads), kThreads, 0, stream, work, count);
+  launch_in_chain(each_kernel<work, Arguments>, unsigned((count + kThreads - 1) / kThreads), kThreads, 0, stream, a,
+                  count);
 }
 
 // The scene of a node, -1 where its slot has no block of the scenes; and its first node of the block.
 template <class T, int D>
-__device__ int scene_of_node(const Topology<T, D>& t, int64_t node, int (&corner)[D]) {
+MPM_HD int scene_of_node(const Topology<T, D>& t, int64_t node, int (&corner)[D]) {
   const int block = t.block[node / kBlockNodes<D>];
   if (block < 0) return -1;
   const int scene = block_coordinates(t.geometry, block, corner);
-#pragma unroll
-  for (int i = 0; i < D; i++) corner[i] *= kBlockWidth;
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    corner[i] *= kBlockWidth;
   return scene < t.scenes ? scene : -1;
 }
 
@@ -39,29 +40,28 @@ int64_t nodes_of(const Topology<T, D>& t) {
   return int64_t(t.max_blocks) * kBlockNodes<D>;
 }
 
-template <class T, int D>
-struct Volumes {
-  HeatVolumesArguments<T, D> a;
-  __device__ void operator()(int64_t p) const { heat_volume(a, p); }
-};
+// Calls work(a, scene, i) at a node of a block of the scenes.
+template <auto work, int D, class Arguments>
+MPM_HD void at_node(const Arguments& a, int64_t i) {
+  int corner[D];
+  const int scene = scene_of_node(a.topology, i, corner);
+  if (scene >= 0) work(a, scene, i);
+}
 
 template <class T, int D>
-struct Means {
-  HeatMeansArguments<T, D> a;
-  __device__ void operator()(int64_t i) const { heat_mean(a, i); }
-};
+MPM_HD void hold(const HeatHoldArguments<T, D>& a, int64_t i) {
+  if (a.fixed[i] || !(a.capacity[i] > T(0))) return;
+  int corner[D];
+  const int scene = scene_of_node(a.topology, i, corner);
+  if (scene < 0) return;
+  const ObstaclePose<T, D> pose = pose_of(a.contact, a.obstacle, scene);
+  if (pose.acts) hold_node(a, pose, scene, corner, int(i % kBlockNodes<D>), i);
+}
 
 template <class T, int D>
-struct Increments {
-  HeatIncrementsArguments<T, D> a;
-  __device__ void operator()(int64_t i) const { heat_increment(a, i); }
-};
-
-template <class T, int D>
-struct Count {
-  HeatCountArguments<T, D> a;
-  __device__ void operator()(int64_t scene) const { count_solve(a, scene); }
-};
+MPM_HD void layer(const HeatLayersArguments<T, D>& a, int64_t p) {
+  heat_layer_of(a, pose_of(a.contact, a.obstacle, scene_of_particle(a, p)), p);
+}
 
 // Values that are not negative are ordered like their bits, and NaN is above them.
 template <class T, int D>
@@ -95,70 +95,26 @@ __global__ void __launch_bounds__(kThreads) largest_kernel(const __grid_constant
   if (largest > 0) raise(scene, largest);
 }
 
-template <class T, int D>
-struct Hold {
-  HeatHoldArguments<T, D> a;
-
-  __device__ void operator()(int64_t i) const {
-    if (a.fixed[i] || !(a.capacity[i] > T(0))) return;
-    int corner[D];
-    const int scene = scene_of_node(a.topology, i, corner);
-    if (scene < 0) return;
-    const ObstaclePose<T, D> pose = pose_of(a.contact, a.obstacle, scene);
-    if (pose.acts) hold_node(a, pose, scene, corner, int(i % kBlockNodes<D>), i);
-  }
-};
-
-template <class T, int D>
-struct Layers {
-  HeatLayersArguments<T, D> a;
-  __device__ void operator()(int64_t p) const {
-    heat_layer_of(a, pose_of(a.contact, a.obstacle, scene_of_particle(a, p)), p);
-  }
-};
-
-template <class T, int D>
-struct FromSurface {
-  HeatFromSurfaceArguments<T, D> a;
-
-  __device__ void operator()(int64_t i) const {
-    int corner[D];
-    const int scene = scene_of_node(a.topology, i, corner);
-    if (scene >= 0) heat_of_surface(a, scene, i);
-  }
-};
-
-template <class T, int D>
-struct Term {
-  HeatTermArguments<T, D> a;
-
-  __device__ void operator()(int64_t i) const {
-    int corner[D];
-    const int scene = scene_of_node(a.topology, i, corner);
-    if (scene >= 0) heat_term(a, scene, i);
-  }
-};
-
 }  // namespace
 
 template <class T, int D>
 void heat_volumes(const HeatVolumesArguments<T, D>& a, Stream stream) {
-  for_each(a.particles, Volumes<T, D>{a}, stream);
+  for_each<heat_volume<T, D>>(a.particles, a, stream);
 }
 
 template <class T, int D>
 void heat_means(const HeatMeansArguments<T, D>& a, Stream stream) {
-  for_each(a.nodes, Means<T, D>{a}, stream);
+  for_each<heat_mean<T, D>>(a.nodes, a, stream);
 }
 
 template <class T, int D>
 void heat_increments(const HeatIncrementsArguments<T, D>& a, Stream stream) {
-  for_each(a.nodes, Increments<T, D>{a}, stream);
+  for_each<heat_increment<T, D>>(a.nodes, a, stream);
 }
 
 template <class T, int D>
 void heat_count(const HeatCountArguments<T, D>& a, Stream stream) {
-  for_each(a.scenes, Count<T, D>{a}, stream);
+  for_each<count_solve<T, D>>(a.scenes, a, stream);
 }
 
 template <class T, int D>
@@ -171,22 +127,22 @@ void heat_largest(const HeatLargestArguments<T, D>& a, Stream stream) {
 
 template <class T, int D>
 void heat_hold(const HeatHoldArguments<T, D>& a, Stream stream) {
-  for_each(nodes_of(a.topology), Hold<T, D>{a}, stream);
+  for_each<hold<T, D>>(nodes_of(a.topology), a, stream);
 }
 
 template <class T, int D>
 void heat_layers(const HeatLayersArguments<T, D>& a, Stream stream) {
-  for_each(a.particles, Layers<T, D>{a}, stream);
+  for_each<layer<T, D>>(a.particles, a, stream);
 }
 
 template <class T, int D>
 void heat_from_surface(const HeatFromSurfaceArguments<T, D>& a, Stream stream) {
-  for_each(nodes_of(a.topology), FromSurface<T, D>{a}, stream);
+  for_each<at_node<heat_of_surface<T, D>, D, HeatFromSurfaceArguments<T, D>>>(nodes_of(a.topology), a, stream);
 }
 
 template <class T, int D>
 void heat_add_term(const HeatTermArguments<T, D>& a, Stream stream) {
-  for_each(nodes_of(a.topology), Term<T, D>{a}, stream);
+  for_each<at_node<heat_term<T, D>, D, HeatTermArguments<T, D>>>(nodes_of(a.topology), a, stream);
 }
 
 MPM_INSTANTIATE(heat_volumes, HeatVolumesArguments)
