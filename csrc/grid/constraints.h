@@ -40,12 +40,14 @@ MPM_HD bool solve_definite(S (&g)[D][D], S (&x)[D], int n) {
     if (!(g[k][k] > S(least))) return false;
     MPM_LOOP for (int i = k + 1; i < n; i++) {
       const S factor = g[i][k] / g[k][k];
-      MPM_LOOP for (int j = k; j < n; j++) g[i][j] = g[i][j] - factor * g[k][j];
+      MPM_LOOP for (int j = k; j < n; j++)
+        g[i][j] = g[i][j] - factor * g[k][j];
       x[i] = x[i] - factor * x[k];
     }
   }
   MPM_LOOP for (int k = n - 1; k >= 0; k--) {
-    MPM_LOOP for (int j = k + 1; j < n; j++) x[k] = x[k] - g[k][j] * x[j];
+    MPM_LOOP for (int j = k + 1; j < n; j++)
+      x[k] = x[k] - g[k][j] * x[j];
     x[k] = x[k] / g[k][k];
   }
   return true;
@@ -66,10 +68,12 @@ MPM_HD bool solve_normals(const Constraints<S, D>& c, unsigned set, S (&b)[Const
   S gram[D][D], x[D];
   MPM_LOOP for (int i = 0; i < n; i++) {
     x[i] = b[member[i]];
-    MPM_LOOP for (int j = 0; j < n; j++) gram[i][j] = dot(c.e[member[i]].normal, c.e[member[j]].normal);
+    MPM_LOOP for (int j = 0; j < n; j++)
+      gram[i][j] = dot(c.e[member[i]].normal, c.e[member[j]].normal);
   }
   if (!solve_definite<S, D>(gram, x, n)) return false;
-  MPM_LOOP for (int i = 0; i < n; i++) b[member[i]] = x[i];
+  MPM_LOOP for (int i = 0; i < n; i++)
+    b[member[i]] = x[i];
   return true;
 }
 
@@ -82,13 +86,16 @@ MPM_HD unsigned stopped_velocities(const Constraints<S, D>& c, const Vector<S, D
   constexpr T unmet = std::numeric_limits<T>::min();  // an equality counts as unmet where it is not in the set
   T least = std::numeric_limits<T>::max();
   unsigned best = 0;
-  MPM_LOOP for (int i = 0; i < c.count; i++) lambda[i] = S(0);
+  MPM_LOOP for (int i = 0; i < c.count; i++)
+    lambda[i] = S(0);
   MPM_LOOP for (unsigned set = 0; set < 1u << c.count && least > T(0); set++) {
     S trial[Constraints<S, D>::most];
-    MPM_LOOP for (int i = 0; i < c.count; i++) trial[i] = dot(c.e[i].normal, c.e[i].velocity + S(-1) * v);
+    MPM_LOOP for (int i = 0; i < c.count; i++)
+      trial[i] = dot(c.e[i].normal, c.e[i].velocity + S(-1) * v);
     if (!solve_normals<S, D>(c, set, trial)) continue;
     Vector<S, D> after = v;
-    MPM_LOOP for (int i = 0; i < c.count; i++) after = after + trial[i] * c.e[i].normal;
+    MPM_LOOP for (int i = 0; i < c.count; i++)
+      after = after + trial[i] * c.e[i].normal;
     T violation = T(0);
     MPM_LOOP for (int i = 0; i < c.count; i++) {
       const bool one_sided = c.e[i].kind == Contact::separate, met = set >> i & 1;
@@ -99,7 +106,8 @@ MPM_HD unsigned stopped_velocities(const Constraints<S, D>& c, const Vector<S, D
     if (!(violation < least)) continue;
     least = violation;
     best = set;
-    MPM_LOOP for (int i = 0; i < c.count; i++) lambda[i] = trial[i];
+    MPM_LOOP for (int i = 0; i < c.count; i++)
+      lambda[i] = trial[i];
   }
   return best;
 }
@@ -124,30 +132,36 @@ MPM_HD void add_friction(const Constraints<S, D>& c, unsigned set, const S (&lam
     surface = (S(1) / sum) * surface;
   } else {  // a coefficient of zero whose derivative is wanted
     surface = zero_vector<S, D>();
-    MPM_LOOP for (int i = 0; i < c.count; i++) if (lambda[i] > S(0) && has_friction(c.e[i].friction)) surface =
-        c.e[i].velocity;
+    MPM_LOOP for (int i = 0; i < c.count; i++) {
+      if (lambda[i] > S(0) && has_friction(c.e[i].friction)) surface = c.e[i].velocity;
+    }
   }
   const Vector<S, D> u = v + S(-1) * surface;
   S normal[Constraints<S, D>::most];
-  MPM_LOOP for (int i = 0; i < c.count; i++) normal[i] = dot(c.e[i].normal, u);
+  MPM_LOOP for (int i = 0; i < c.count; i++)
+    normal[i] = dot(c.e[i].normal, u);
   if (!solve_normals<S, D>(c, set, normal)) return;
   Vector<S, D> tangential = u;
-  MPM_LOOP for (int i = 0; i < c.count; i++) tangential = tangential + (S(0) - normal[i]) * c.e[i].normal;
+  MPM_LOOP for (int i = 0; i < c.count; i++)
+    tangential = tangential + (S(0) - normal[i]) * c.e[i].normal;
   const S squared = dot(tangential, tangential);
   if (!(squared > S(0))) return;
   const S speed = sqrt(squared);
   if (!(sum < speed)) {
-    MPM_LOOP for (int i = 0; i < c.count; i++) change[i] = change[i] + (S(0) - limit[i] / sum) * tangential;
+    MPM_LOOP for (int i = 0; i < c.count; i++)
+      change[i] = change[i] + (S(0) - limit[i] / sum) * tangential;
     return;
   }
-  MPM_LOOP for (int i = 0; i < c.count; i++) change[i] = change[i] + (S(0) - limit[i] / speed) * tangential;
+  MPM_LOOP for (int i = 0; i < c.count; i++)
+    change[i] = change[i] + (S(0) - limit[i] / speed) * tangential;
 }
 
 // Changes of a velocity v by each surface.
 template <class S, int D>
 MPM_HD void changes_of_constraints(const Constraints<S, D>& c, const Vector<S, D>& v,
                                    Vector<S, D> (&change)[Constraints<S, D>::most]) {
-  MPM_LOOP for (int i = 0; i < c.count; i++) change[i] = zero_vector<S, D>();
+  MPM_LOOP for (int i = 0; i < c.count; i++)
+    change[i] = zero_vector<S, D>();
   MPM_LOOP for (int i = 0; i < c.count; i++) {
     if (c.e[i].kind != Contact::sticky) continue;
     change[i] = c.e[i].velocity + S(-1) * v;
@@ -174,7 +188,8 @@ template <class S, int D>
 MPM_HD Vector<S, D> after_constraints(const Constraints<S, D>& c, const Vector<S, D>& v) {
   Vector<S, D> change[Constraints<S, D>::most], after = v;
   changes_of_constraints<S, D>(c, v, change);
-  MPM_LOOP for (int i = 0; i < c.count; i++) after = after + change[i];
+  MPM_LOOP for (int i = 0; i < c.count; i++)
+    after = after + change[i];
   return after;
 }
 

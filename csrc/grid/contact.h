@@ -155,9 +155,9 @@ MPM_HD_CALL void find_surfaces(bool wanted, const SlotPoses<T, D>& poses, const 
   c.position = within_walls(a, position, T(0), c.sign);
   int around = obstacle_around(wanted, poses, c.position);
   const T near = NearestSurface<T, D>::near_wall(a);
-  MPM_LOOP for (int face = 0; wanted && face < 2 * D;
-                face++) if (a.wall_kind[face] != Contact::open && wall_height(a, face, c.position) <= near) c.walls |=
-      1u << face;
+  MPM_LOOP for (int face = 0; wanted && face < 2 * D; face++) {
+    if (a.wall_kind[face] != Contact::open && wall_height(a, face, c.position) <= near) c.walls |= 1u << face;
+  }
   const bool in_gap = wanted && around < 0 && c.walls;  // between an obstacle and a wall
   if (any_of_warp(in_gap)) {
     Vector<T, D> sign;
@@ -245,7 +245,8 @@ MPM_HD void add_walls(const ContactArguments<T, D>& a, const NodeContact<T, D>& 
 template <class T, int D>
 MPM_HD void find_constraints(const SlotPoses<T, D>& poses, const NodeContact<T, D>& contact, Constraints<T, D>& c) {
   c.count = 0;
-  MPM_LOOP for (int i = 0; i < contact.count; i++) add_face(poses[contact.obstacle[i]], contact, i, c);
+  MPM_LOOP for (int i = 0; i < contact.count; i++)
+    add_face(poses[contact.obstacle[i]], contact, i, c);
   add_walls(poses.a, contact, c);
 }
 

@@ -242,7 +242,7 @@ class SolidAt {
   // Finds the faces that the node meets; their number is zero where none is near enough.
   MPM_HD void find(bool wanted) {
     MPM_LOOP for (uint64_t left = wanted ? poses_.s.near : 0; any_of_warp(left != 0); left &= left - 1)
-        add_faces(left != 0, lowest_bit(left));
+      add_faces(left != 0, lowest_bit(left));
     Foot<T, D> foot;
     MPM_LOOP while (true) {
       wanted = wanted && next_set(foot);
@@ -260,8 +260,9 @@ class SolidAt {
   MPM_HD void add(Face<T, D>& face) {
     face.rounded = rounded_depth(a_, face.depth);
     int at = faces_.count < kMostFaces ? faces_.count++ : kMostFaces;
-    MPM_LOOP for (; at > 0 && goes_before(face, faces_.e[at - 1]); at--) if (at < kMostFaces) faces_.e[at] =
-        faces_.e[at - 1];
+    MPM_LOOP for (; at > 0 && goes_before(face, faces_.e[at - 1]); at--) {
+      if (at < kMostFaces) faces_.e[at] = faces_.e[at - 1];
+    }
     if (at < kMostFaces) faces_.e[at] = face;
   }
 
@@ -295,14 +296,17 @@ class SolidAt {
   MPM_HD bool next_set(Foot<T, D>& foot) const {
     int at = 0;
     MPM_LOOP while (at < foot.count &&
-                    foot.member[at] + 1 == (at + 1 < foot.count ? foot.member[at + 1] : faces_.count)) at++;
+                    foot.member[at] + 1 == (at + 1 < foot.count ? foot.member[at + 1] : faces_.count))
+      at++;
     const bool ends = at == foot.count || (at == foot.count - 1 && is_deeper(foot.member[at] + 1));
     if (ends && (foot.count == D || foot.count == faces_.count || is_deeper(foot.count))) return false;
     if (ends)
       at = foot.count++;
     else
       foot.member[at]++;
-    MPM_LOOP for (int i = 0; i < foot.count; i++) if (i < at || ends) foot.member[i] = i;
+    MPM_LOOP for (int i = 0; i < foot.count; i++) {
+      if (i < at || ends) foot.member[i] = i;
+    }
     return true;
   }
 
@@ -326,7 +330,8 @@ class SolidAt {
     const bool is_box = wanted && shape_of(k) == ObstacleShape::box;  // whose faces are all far where it is
     V unused;
     if (!(height_of(is_box, k, node_, unused) <= reach_)) count = 0;
-    MPM_LOOP for (int f = 0; any_of_warp(f < count); f++) add_face(f < count, k, count == 1 ? -1 : f);
+    MPM_LOOP for (int f = 0; any_of_warp(f < count); f++)
+      add_face(f < count, k, count == 1 ? -1 : f);
   }
 
   MPM_HD void add_face(bool wanted, int k, int f) {
@@ -377,7 +382,8 @@ class SolidAt {
     }
     const bool flat = wanted && nearest.flat, is_face = is_a_face(flat, k, first, nearest.normal);
     if (wanted && (is_face || !flat)) add(nearest);
-    MPM_LOOP for (int i = 0; i < kLeaning; i++) add_plane(flat, k, seen_from(flat, k, first, nearest.normal, away, i));
+    MPM_LOOP for (int i = 0; i < kLeaning; i++)
+      add_plane(flat, k, seen_from(flat, k, first, nearest.normal, away, i));
     const bool is_between = ridge && flat;
     return is_covered(wanted && !is_between, k, first, nearest.normal, start) || is_between;
   }
@@ -416,7 +422,8 @@ class SolidAt {
     if (wanted) rotation = poses_[k].rotation;
     MPM_LOOP for (int i = 1; i < count; i++) {
       V way;
-      MPM_LOOP for (int j = 0, rest = i; j < D; j++, rest /= 3) way[j] = T(rest % 3 == 2 ? -1 : rest % 3);
+      MPM_LOOP for (int j = 0, rest = i; j < D; j++, rest /= 3)
+        way[j] = T(rest % 3 == 2 ? -1 : rest % 3);
       const V at = node_ + reach_ * (rotation * way);
       add_plane(sees_a_face(wanted, k, at), k, at);
     }
@@ -477,7 +484,8 @@ class SolidAt {
   // The nearest point on all faces of a foot; false where there is none whose faces all stop the node.
   MPM_HD bool solve(bool wanted, Foot<T, D>& foot) const {
     bool curved = false;
-    MPM_LOOP for (int i = 0; i < foot.count; i++) curved = curved || !faces_.e[foot.member[i]].flat;
+    MPM_LOOP for (int i = 0; i < foot.count; i++)
+      curved = curved || !faces_.e[foot.member[i]].flat;
     foot.at = node_;
     const int rounds = curved && foot.count > 1 ? 3 : 1;
     MPM_LOOP for (int round = 0; any_of_warp(wanted && round < rounds); round++) {
@@ -498,7 +506,8 @@ class SolidAt {
     T gram[D][D], again[D][D], ones[D];
     MPM_LOOP for (int i = 0; i < foot.count; i++) {
       ones[i] = T(1);
-      MPM_LOOP for (int j = 0; j < foot.count; j++) gram[i][j] = again[i][j] = dot(normal[i], normal[j]);
+      MPM_LOOP for (int j = 0; j < foot.count; j++)
+        gram[i][j] = again[i][j] = dot(normal[i], normal[j]);
     }
     if (!solve_definite<T, D>(gram, share, foot.count) || !solve_definite<T, D>(again, ones, foot.count)) return false;
     foot.at = node_, foot.step = zero_vector<T, D>();
@@ -532,11 +541,12 @@ class SolidAt {
   // tangents of a rounded body meet outside. Of samples, which round edges; others do not get here.
   MPM_HD bool is_inner(bool wanted, const Foot<T, D>& foot) const {
     bool sampled = false;
-    MPM_LOOP for (int i = 0; i < foot.count; i++) sampled = sampled || is_of_samples(foot, i);
+    MPM_LOOP for (int i = 0; i < foot.count; i++)
+      sampled = sampled || is_of_samples(foot, i);
     if (!any_of_warp(wanted && sampled)) return wanted;
     V normal[D], unused;
     MPM_LOOP for (int i = 0; i < D; i++)
-        height_at(wanted && sampled && i < foot.count, faces_.e[foot.member[i]], foot.at, normal[i]);
+      height_at(wanted && sampled && i < foot.count, faces_.e[foot.member[i]], foot.at, normal[i]);
     MPM_LOOP for (int i = 0; i < D; i++) {
       const bool acts = wanted && i < foot.count && is_of_samples(foot, i);
       const int k = faces_.e[foot.member[i]].obstacle;
@@ -558,11 +568,13 @@ class SolidAt {
     T gram[D][D], share[D];
     MPM_LOOP for (int j = 0; j < foot.count; j++) {
       share[j] = T(i == j);
-      MPM_LOOP for (int l = 0; l < foot.count; l++) gram[j][l] = dot(normal[j], normal[l]);
+      MPM_LOOP for (int l = 0; l < foot.count; l++)
+        gram[j][l] = dot(normal[j], normal[l]);
     }
     if (!solve_definite<T, D>(gram, share, foot.count)) return false;
     way = foot.step;
-    MPM_LOOP for (int j = 0; j < foot.count; j++) way = way + T(-2) * share[j] * normal[j];
+    MPM_LOOP for (int j = 0; j < foot.count; j++)
+      way = way + T(-2) * share[j] * normal[j];
     return true;
   }
 
@@ -632,8 +644,8 @@ class SolidAt {
 
   MPM_HD T largest_friction(const Foot<T, D>& foot) const {
     T friction = T(0);
-    MPM_LOOP for (int i = 0; i < foot.count; i++) friction =
-        max(friction, poses_.s.row[faces_.e[foot.member[i]].obstacle].friction);
+    MPM_LOOP for (int i = 0; i < foot.count; i++)
+      friction = max(friction, poses_.s.row[faces_.e[foot.member[i]].obstacle].friction);
     return friction;
   }
 
