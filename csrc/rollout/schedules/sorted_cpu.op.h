@@ -1,16 +1,20 @@
 #pragma once
 
 #include <limits>
+#include <utility>
 
 #include "cpu/schedule.h"
 #include "rollout/heat_steps.h"
 #include "rollout/own_field.h"
 #include "rollout/step_kernels.h"
 
-// The particles of a call on the CPU. They move in place and are reordered by cell from time to time, so that packs of
-// particles are loads and stores of whole registers. At the end they are restored to the given order.
 namespace mpm {
 
+// What a table gives in the place of the number of a parameter: the expansion of a material, the coherency of a liquid.
+constexpr int64_t kExpansion = -1, kCoherency = -2;
+
+// The particles of a call on the CPU. They move in place and are reordered by cell from time to time, so that packs of
+// particles are loads and stores of whole registers. At the end they are restored to the given order.
 template <class T, int D>
 class SortedCpu {
  public:
@@ -195,8 +199,8 @@ void SortedCpu<T, D>::find_laws() {
   find_thermal();
 }
 
-// What laws need of the temperature, and the rows for it. Records of the call: a law, then the number of a parameter,
-// −1 for the expansion of its material or −2 for its coherency, and the number of a table.
+// What laws need of the temperature, and the rows for it. Records of the call: a law, the number of a parameter,
+// kExpansion or kCoherency, and the number of a table.
 template <class T, int D>
 void SortedCpu<T, D>::find_thermal() {
   STD_TORCH_CHECK(in_.thermal.size() % 3 == 0, "thermal must have records of 3 numbers, got ", in_.thermal.size());
@@ -205,24 +209,25 @@ void SortedCpu<T, D>::find_thermal() {
     const int64_t k = in_.thermal[r], what = in_.thermal[r + 1];
     STD_TORCH_CHECK(k >= 0 && k < int64_t(laws_.size()), "thermal must name laws 0 to ", laws_.size() - 1, ", got ", k);
     ChunkLaw<T, D>& law = laws_[size_t(k)];
-    STD_TORCH_CHECK(what >= -2 && what < int64_t(s_.calls[size_t(k)].parameters.size()),
+    STD_TORCH_CHECK(what >= kCoherency && what < int64_t(s_.calls[size_t(k)].parameters.size()),
                     "thermal must name parameters of a law, got ", what);
     const TemperatureTable<T> own = table(in_.thermal[r + 2]);
-    if (what == -2) {
+    if (what == kCoherency) {
       law.coherency = own.value[0];
       continue;
     }
     reads_temperature = true;
-    expands |= what == -1;
-    (what == -1 ? law.expansion : law.tables[what]) = own;
+    expands |= what == kExpansion;
+    (what == kExpansion ? law.expansion : law.tables[what]) = own;
     if (what >= 0) law.parameters[what] = copied_rows_++;
   }
   STD_TORCH_CHECK((!reads_temperature && !s_.melts) || heat, "laws of temperature need heat");
   STD_TORCH_CHECK(!s_.melts || heat->liquid_column() >= 0, "a material that melts needs heat with a melting point");
   if (reads_temperature) a_.temperature_row = copied_rows_++;
   if (s_.melts) a_.fraction_row = copied_rows_++;
-  if (s_.melts || expands) a_.elastic_row = copied_rows_, copied_rows_ += D * D + 1;
-  if (s_.melts) a_.liquid_row = copied_rows_, copied_rows_ += D * D;
+  const auto rows = [this](int count) { return std::exchange(copied_rows_, copied_rows_ + count); };
+  if (s_.melts || expands) a_.elastic_row = rows(D * D + 1);
+  if (s_.melts) a_.liquid_row = rows(D * D);
 }
 
 template <class T, int D>
