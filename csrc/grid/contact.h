@@ -257,17 +257,38 @@ MPM_HD Vector<T, D> reflected(const Vector<T, D>& sign, Vector<T, D> v) {
   return v;
 }
 
+// What a node meets, in the form in which it changes the velocity.
+template <class T, int D>
+struct alignas(16) MetSurfaces {
+  int any = 0;
+  Vector<T, D> sign;
+  Constraints<T, D> constraints;
+
+  MPM_HD Vector<T, D> after(const Vector<T, D>& v) const {
+    return any ? reflected(sign, after_constraints(constraints, reflected(sign, v))) : v;
+  }
+};
+
+template <class T, int D>
+MPM_HD_CALL void find_met(bool wanted, const SlotPoses<T, D>& poses, const Vector<T, D>& position,
+                          MetSurfaces<T, D>& met) {
+  NodeContact<T, D> contact;
+  find_surfaces(wanted, poses, position, contact);
+  join_warp();
+  met.any = contact.count > 0;
+  if (!met.any) return;
+  met.sign = contact.sign;
+  find_constraints(poses, contact, met.constraints);
+}
+
 // Replaces the velocity of a node by that after contact with all surfaces that are near.
 template <class T, int D>
 MPM_HD_CALL void apply_surfaces(bool wanted, const SlotPoses<T, D>& poses, const Vector<T, D>& position,
                                 Vector<T, D>& v) {
-  NodeContact<T, D> contact;
-  find_surfaces(wanted, poses, position, contact);
+  MetSurfaces<T, D> met;
+  find_met(wanted, poses, position, met);
   join_warp();
-  if (contact.count == 0) return;
-  Constraints<T, D> constraints;
-  find_constraints(poses, contact, constraints);
-  v = reflected(contact.sign, after_constraints(constraints, reflected(contact.sign, v)));
+  if (wanted) v = met.after(v);
 }
 
 // The velocity v of a node after contact. By all threads of a warp, also of nodes that meet nothing.
@@ -282,6 +303,81 @@ MPM_HD Vector<T, D> after_contact(const SlotPoses<T, D>& poses, const NodeTouch<
   return touch.obstacle >= 0 ? touch.after(v) : v;
 }
 
+// ---- surfaces that are found once
+
+// Of a node of a scene, never zero.
+template <class T, int D>
+MPM_HD unsigned long long key_of_node(const ContactArguments<T, D>& a, int scene, const int (&corner)[D], int local) {
+  unsigned long long key = static_cast<unsigned long long>(scene);
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    key = key * static_cast<unsigned long long>(a.geometry.blocks[i] * kBlockWidth) +
+          static_cast<unsigned long long>(lattice_index<D>(corner, i, local));
+  return key + 1;
+}
+
+#ifdef __CUDA_ARCH__
+constexpr unsigned long long kBeingWritten = 1ull << 63;
+constexpr int kMostProbes = 8;
+
+__device__ inline int place_of_key(unsigned long long key, int probe, int size) {
+  return int((key * 0x9E3779B97F4A7C15ull >> 40) + unsigned(probe)) & (size - 1);  // Fibonacci hashing
+}
+#endif
+
+// Reads the surfaces of a node that are known; false if they are not. A search takes a hundred times as long.
+template <class T, int D>
+MPM_HD bool recall([[maybe_unused]] const ContactArguments<T, D>& a, [[maybe_unused]] unsigned long long key,
+                   [[maybe_unused]] MetSurfaces<T, D>& met) {
+#ifdef __CUDA_ARCH__
+  if (!a.known_nodes) return false;
+  MPM_LOOP for (int probe = 0; probe < kMostProbes; probe++) {
+    const int at = place_of_key(key, probe, a.known_size);
+    const unsigned long long found = __ldcg(a.known_nodes + at);
+    if (found == 0) return false;
+    if (found != key) continue;
+    __threadfence();
+    MPM_LOOP for (unsigned k = 0; k < sizeof(met) / sizeof(uint4); k++) reinterpret_cast<uint4*>(&met)[k] =
+        __ldcg(reinterpret_cast<const uint4*>(static_cast<const MetSurfaces<T, D>*>(a.known) + at) + k);
+    return true;
+  }
+#endif
+  return false;
+}
+
+// Whether the obstacles of a scene stay what they are now.
+template <class T, int D>
+MPM_HD bool obstacles_rest(const ContactArguments<T, D>& a, int scene) {
+  const double time = contact_time(a, scene);
+  const ObstacleRow<T, D>* const row = rows_of_scene(a, scene);
+  bool rest = a.step_stride == 0;
+  MPM_LOOP for (int k = 0; rest && k < a.obstacles; k++) {
+    const ObstacleKind& kind = a.kind[k];
+    if (kind.scene >= 0 && kind.scene != scene) continue;
+    rest = time >= kind.start && kind.end > std::numeric_limits<double>::max();
+    rest = rest && is_zero(row[k].velocity) && is_zero(row[k].angular_velocity);
+  }
+  return rest;
+}
+
+// Stores the surfaces of a node where the obstacles rest and there is room.
+template <class T, int D>
+MPM_HD void remember([[maybe_unused]] const ContactArguments<T, D>& a, [[maybe_unused]] int scene,
+                     [[maybe_unused]] unsigned long long key, [[maybe_unused]] const MetSurfaces<T, D>& met) {
+#ifdef __CUDA_ARCH__
+  if (!a.known_nodes || !obstacles_rest(a, scene)) return;
+  MPM_LOOP for (int probe = 0; probe < kMostProbes; probe++) {
+    const int at = place_of_key(key, probe, a.known_size);
+    const unsigned long long before = atomicCAS(a.known_nodes + at, 0ull, key | kBeingWritten);
+    if ((before & ~kBeingWritten) == key) return;  // by another thread
+    if (before != 0) continue;
+    static_cast<MetSurfaces<T, D>*>(a.known)[at] = met;
+    __threadfence();
+    atomicExch(a.known_nodes + at, key);
+    return;
+  }
+#endif
+}
+
 // Of a node whose thread looks at it alone: the slot and its touch are found in one loop over the obstacles.
 template <class T, int D>
 MPM_HD NodeTouch<T, D> lone_touch(const ContactArguments<T, D>& a, int scene, const int (&corner)[D], int local) {
@@ -294,9 +390,17 @@ MPM_HD NodeTouch<T, D> lone_touch(const ContactArguments<T, D>& a, int scene, co
 template <class T, int D>
 MPM_HD_CALL void apply_several(bool wanted, const ContactArguments<T, D>& a, int scene, const int (&corner)[D],
                                int local, Vector<T, D>& v) {
-  ContactSlot<T, D> slot;
-  if (wanted) slot = contact_slot(a, scene, corner);
-  apply_surfaces(wanted, SlotPoses<T, D>(a, slot), node_position(a, corner, local), v);
+  MetSurfaces<T, D> met;
+  const unsigned long long key = key_of_node(a, scene, corner, local);
+  const bool searches = wanted && !recall(a, key, met);
+  if (any_of_warp(searches)) {
+    ContactSlot<T, D> slot;
+    if (searches) slot = contact_slot(a, scene, corner);
+    find_met(searches, SlotPoses<T, D>(a, slot), node_position(a, corner, local), met);
+    join_warp();
+    if (searches) remember(a, scene, key, met);
+  }
+  if (wanted) v = met.after(v);
 }
 
 // Replaces the velocity of a node that meets several surfaces by that after contact, and returns whether it does. By

@@ -4,6 +4,7 @@
 #include <string>
 #include <type_traits>
 
+#include "grid/contact.h"
 #include "grid/impulse.op.h"
 #include "grid/obstacle.op.h"
 #include "grid/walls.op.h"
@@ -40,6 +41,7 @@ struct Substeps {
   Tensor displacements;           // counters of two substeps in turn, if activations last
   Tensor largest_mass;            // of a particle, where sums are fixed
   NextGridArguments<T, D> next;   // with `update` and `contact` of this struct
+  Tensor known_nodes, known;      // see ContactArguments
   Tensor impulse, impulse_slots;  // accumulated on obstacles and walls, if wanted; see `add_impulses_to`
   bool obstacles = false, fused = false;
   Tensor kept;                     // of FLIP, see `keep_velocities`
@@ -324,6 +326,7 @@ struct Substeps {
   }
 
   void make_pool(backend::Stream stream);
+  void make_known_nodes(backend::Stream stream);
   void use_pool();
 
  private:
@@ -474,6 +477,7 @@ template <class T, int D>
 void Substeps<T, D>::make_pool(backend::Stream stream) {
   const bool apart = obstacles && !next.obstacles;  // contact is separate from the grid update
   pool.make(in.x, activation, apart, stream);
+  if (MPM_BACKEND == MPM_BACKEND_IS_cuda && obstacles && in.resident && in.n > 1) make_known_nodes(stream);
   if (largest_mass.defined()) pool.nodes = empty(in.x, Pool<T, D>::nodes_shape(activation), ScalarType::Long);
   if (impulse.defined() && (MPM_BACKEND == MPM_BACKEND_IS_cpu || in.lattice.deterministic()))
     impulse_slots = empty(in.x, {activation.slots(), impulse_shape()[1] * kImpulse<D>}, ScalarType::Double);
@@ -482,6 +486,19 @@ void Substeps<T, D>::make_pool(backend::Stream stream) {
     backend::clear(pool.nodes, stream);
     next.emptied = static_cast<NodeRow<T, D>*>(pool.nodes.data_ptr());
   }
+}
+
+// The table of surfaces that are found once in the call.
+template <class T, int D>
+void Substeps<T, D>::make_known_nodes(backend::Stream stream) {
+  constexpr int least = 1 << 14, most = 1 << 18, of_scene = 256;
+  contact.known_size = least;
+  while (contact.known_size < most && contact.known_size < of_scene * in.scenes) contact.known_size *= 2;
+  known_nodes = empty(in.x, {contact.known_size}, ScalarType::Long);
+  known = empty(in.x, {contact.known_size * int64_t(sizeof(MetSurfaces<T, D>))}, ScalarType::Byte);
+  backend::clear(known_nodes, stream);
+  contact.known_nodes = static_cast<unsigned long long*>(known_nodes.data_ptr());
+  contact.known = known.data_ptr();
 }
 
 // Sets the present activation and pool in the arguments of the kernels.
