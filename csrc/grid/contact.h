@@ -336,8 +336,9 @@ MPM_HD bool recall([[maybe_unused]] const ContactArguments<T, D>& a, [[maybe_unu
     if (found == 0) return false;
     if (found != key) continue;
     __threadfence();
-    MPM_LOOP for (unsigned k = 0; k < sizeof(met) / sizeof(uint4); k++) reinterpret_cast<uint4*>(&met)[k] =
-        __ldcg(reinterpret_cast<const uint4*>(static_cast<const MetSurfaces<T, D>*>(a.known) + at) + k);
+    MPM_LOOP for (unsigned k = 0; k < sizeof(met) / sizeof(uint4); k++)
+      reinterpret_cast<uint4*>(&met)[k] =
+          __ldcg(reinterpret_cast<const uint4*>(static_cast<const MetSurfaces<T, D>*>(a.known) + at) + k);
     return true;
   }
 #endif

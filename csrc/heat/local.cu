@@ -1,6 +1,6 @@
 #include "heat/local.h"
 
-#include "cuda/programmatic_launch.cuh"
+#include "cuda/for_each.cuh"
 #include "heat/kernels.h"
 
 // Steps of heat at single nodes, particles and scenes, and boundaries of heat.
@@ -8,21 +8,6 @@ namespace mpm::cuda {
 namespace {
 
 constexpr int kThreads = 256;
-
-// Calls work(a, i) for i < count, one per thread.
-template <auto work, class Arguments>
-__global__ void __launch_bounds__(kThreads) each_kernel(const __grid_constant__ Arguments a, int64_t count) {
-  grid_dependency_sync();
-  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-  if (i < count) work(a, i);
-}
-
-template <auto work, class Arguments>
-void for_each(int64_t count, const Arguments& a, Stream stream) {
-  if (count == 0) return;
-  launch_in_chain(each_kernel<work, Arguments>, unsigned((count + kThreads - 1) / kThreads), kThreads, 0, stream, a,
-                  count);
-}
 
 // The scene of a node, -1 where its slot has no block of the scenes; and its first node of the block.
 template <class T, int D>

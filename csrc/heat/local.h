@@ -29,6 +29,7 @@ MPM_HD void heat_volume(const HeatVolumesArguments<T, D>& a, int64_t p) {
   else if (a.F.pointer)
     volume = volume * determinant(load_matrix<D>(at, a.F));
   store_scalar(at, a.volume, volume);
+  if (a.dissipated.pointer) store_scalar(at, a.dissipated, T(0));
 }
 
 // Signed distance from an obstacle; infinite while it is not there. The kernel of contact needs no distance from the
@@ -68,6 +69,12 @@ MPM_HD void heat_layer_of(const HeatLayersArguments<T, D>& a, const ObstaclePose
     store_scalar(at, a.conductance, conductance);
   }
   store_scalar(at, a.exchange, exchange);
+}
+
+// Heat from inside the matter of a particle [W], in a step of dt; none in a paused scene.
+template <class T>
+MPM_HD T dissipated_power(const T& energy, const T& rest_volume, const T& dt) {
+  return energy * rest_volume / select(dt > T(0), dt, T(1));
 }
 
 // ---- nodes

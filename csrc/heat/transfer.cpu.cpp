@@ -85,6 +85,10 @@ void heat_surface(const HeatSurfaceArguments<T, D>& a) {
             c.slope[d][k] = P(0), c.gradient[d][k] = 1 + d == k ? slope : P(0);
         }
         if (a.power.pointer) c.value[0] = volume * load(a.power, g, scene);
+        if (a.dissipated.pointer) {
+          const P energy = P(a.share) * load(a.dissipated, g), dt(time_step(a.scene_dt, a.dt, scene));
+          c.value[0] = c.value[0] + dissipated_power(energy, load(a.rest, g), dt);
+        }
         return c;
       });
 }

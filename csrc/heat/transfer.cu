@@ -97,14 +97,26 @@ struct HeatSurfaceSource {
   Columns<const T, D> position;
   Columns<const T, 1> volume;
   HeatValue<T> power;
+  Columns<const T, 1> dissipated, rest;
+  T share;
+  TimeStep<T> time_step;
 
   explicit HeatSurfaceSource(const HeatSurfaceArguments<T, D>& a)
-      : topology(a.topology), nodes(a.sums), position(a.x), volume(a.volume), power(a.power) {}
+      : topology(a.topology),
+        nodes(a.sums),
+        position(a.x),
+        volume(a.volume),
+        power(a.power),
+        dissipated(a.dissipated),
+        rest(a.rest),
+        share(T(a.share)),
+        time_step{a.scene_dt, T(a.dt)} {}
 
   __device__ Contribution<T, D, 1, D> load(int p, int scene) const {
     Contribution<T, D, 1, D> c{};
     const T v = volume.at(p);
     c.plain[0] = power.pointer ? v * read_value(power, p, scene) : T(0);
+    if (dissipated.present()) c.plain[0] += dissipated_power(share * dissipated.at(p), rest.at(p), time_step.of(scene));
 #pragma unroll
     for (int d = 0; d < D; d++) c.gradient[d][d] = topology.geometry.inverse_dx * v;
     return c;

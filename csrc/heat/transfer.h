@@ -31,12 +31,12 @@ struct HeatParticles {
   Field<const T> volume;                   // present volume [P]
 };
 
-// Present volumes, from rest volumes and F or J.
+// Present volumes, from rest volumes and F or J; before laws, whose dissipated energy begins with zero.
 template <class T, int D>
 struct HeatVolumesArguments {
   int64_t particles = 0;
   Field<const T> rest, F, J;
-  Field<T> volume;
+  Field<T> volume, dissipated;  // the energy is absent where none becomes heat
 };
 
 template <class T, int D>
@@ -126,12 +126,17 @@ struct HeatFromSurfaceArguments {
   T* source = nullptr;
 };
 
-// Sums for heat from inside the matter, in the first channel, and for the free surface: Σ V ∇N of each node.
+// Sums for heat from inside the matter, in the first channel: a power, and energy that laws have dissipated in the
+// step; and for the free surface: Σ V ∇N of each node.
 template <class T, int D>
 struct HeatSurfaceArguments {
   Topology<T, D> topology;
-  Field<const T> x, volume;  // present volume
-  HeatValue<T> power;        // [W/m³]; without a pointer there is none
+  Field<const T> x, volume;         // present volume
+  HeatValue<T> power;               // [W/m³]; without a pointer there is none
+  Field<const T> dissipated, rest;  // energy per rest volume [J/m³], absent where there is none, and rest volume
+  double share = 0;                 // of that energy
+  Field<const T> scene_dt;
+  double dt = 0;
   bool deterministic = false;
   NodeField<T> sums;  // kHeatChannels, zero on entry
 };

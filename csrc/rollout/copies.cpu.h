@@ -2,7 +2,6 @@
 
 #include "cpu/chunk.h"
 #include "cpu/parallel.h"
-#include "pointwise/thermal.h"
 #include "rollout/laws_p2g.h"
 
 // Copies of the rows of a chunk of particles, on which laws act.
@@ -92,24 +91,21 @@ class Copies {
     if (mixed || (material && (only < 0 || only >= a_.material_count))) {  // some particles may have no law
       for (int k = 0; k < D * D; k++) __builtin_memset(row(R::stress + k), 0, count_ * sizeof(T));
     }
+    ThermalLawsArguments<T, D> thermal;
     for (int k = 0; k < a_.law_count; k++) {
       const ChunkLaw<T, D>& own = a_.laws[k];
       if (material && !mixed && own.material != only) continue;
-      evaluate_tables(own);
       LawUpdateArguments<T, D> law = here(own);
       if (mixed) law.law.members = {material, 1, own.material};
-      if (own.melts) {
-        use_elastic(own, law);
-        law.stress = written(a_.liquid_row, D);
-        own.update(law, nullptr);
-        end_thermal(a_.laws[k - 1], &own, law.law.members);
-        continue;
+      const bool has_liquid = k + 1 < a_.law_count && a_.laws[k + 1].melts;
+      if (!own.melts) {
+        thermal = thermal_laws(own, has_liquid ? &own + 1 : nullptr, law.law.members);
+        for (int i = 0; i < count_ && thermal.begins(); i++) begin_laws_of(thermal, i);
       }
-      const ChunkLaw<T, D>* const liquid = k + 1 < a_.law_count && a_.laws[k + 1].melts ? &own + 1 : nullptr;
-      const bool thermal = liquid || own.expansion.knots > 0;
-      if (thermal) begin_thermal(own, liquid), use_elastic(own, law);
+      if (thermal.has_elastic()) use_elastic(own, law);
+      if (own.melts) law.stress = written(a_.liquid_row, D);
       own.update(law, nullptr);
-      if (thermal && !liquid) end_thermal(own, nullptr, law.law.members);
+      for (int i = 0; i < count_ && thermal.ends() && !has_liquid; i++) end_laws_of(thermal, i);
     }
   }
 
@@ -181,68 +177,45 @@ class Copies {
 
   Field<T> written(int r, int inner) const { return {row(r), {1, inner * kCopyLine, kCopyLine}}; }
 
-  static T value_at(const TemperatureTable<T>& table, const T& theta) {
-    int left = 0;
-    while (left + 2 < table.knots && theta > table.temperature[left + 1]) left++;
-    if (table.knots == 1) return table.value[0];
-    const T* const knot = table.temperature + left;
-    const T share = clamp_to_unit((theta - knot[0]) / (knot[1] - knot[0]));
-    return table.value[left] + share * (table.value[left + 1] - table.value[left]);
-  }
-
-  void evaluate_tables(const ChunkLaw<T, D>& law) const {
-    for (int k = 0; k < kMostParameters; k++) {
-      if (law.tables[k].knots == 0) continue;
-      const T* const theta = row(a_.temperature_row);
-      T* const to = row(law.parameters[k]);
-      for (int i = 0; i < count_; i++) to[i] = value_at(law.tables[k], theta[i]);
-    }
-  }
-
-  T stretch_of(const ChunkLaw<T, D>& first, int i) const {
-    if (first.expansion.knots == 0) return T(1);
-    const T theta = row(a_.temperature_row)[i];
-    return thermal_stretch(value_at(first.expansion, theta), theta);
-  }
-
   // The state of a law is F or J without expansion.
   void use_elastic(const ChunkLaw<T, D>& law, LawUpdateArguments<T, D>& u) const {
     u.law.state = law.gradient ? field(a_.elastic_row) : Field<const T>{row(a_.elastic_row + D * D), {1, 0, 0}};
     if (law.plastic) u.state = written(a_.elastic_row, D);
   }
 
-  // F and J without expansion, and of both phases of a material that melts.
-  void begin_thermal(const ChunkLaw<T, D>& first, const ChunkLaw<T, D>* liquid) const {
-    const bool gradient = liquid || first.gradient, ratio = liquid || !first.gradient;
-    const Field<T> F_elastic = written(a_.elastic_row, D), J_elastic{row(a_.elastic_row + D * D), {1, 0, 0}};
-    const Field<const T> F = given(R::F), J{given_[R::J], {1, 0, 0}};
-    for (int64_t i = 0; i < count_; i++) {
-      const One<T> at{i};
-      const T factor = T(1) / stretch_of(first, int(i));
-      Phases<T, D> phases{T(1), zero_matrix<T, D>()};
-      if (gradient) phases.F = factor * load_matrix<D>(at, F);
-      if (ratio) phases.J = volume_of_stretch<D>(factor) * load_scalar(at, J);
-      if (liquid) phases = phases_of(phases.J, phases.F, row(a_.fraction_row)[i], liquid->coherency);
-      if (gradient) store_matrix<D>(at, F_elastic, phases.F);
-      if (ratio) store_scalar(at, J_elastic, phases.J);
+  // Of a material with its first law, and that of its liquid if it melts.
+  ThermalLawsArguments<T, D> thermal_laws(const ChunkLaw<T, D>& first, const ChunkLaw<T, D>* liquid,
+                                          const Members& members) const {
+    ThermalLawsArguments<T, D> a;
+    a.members = members;
+    add_tables(first, a);
+    if (liquid) add_tables(*liquid, a);
+    a.theta = column(a_.temperature_row);
+    a.expansion = first.temperature.expansion;
+    if (!liquid && a.expansion.knots == 0) return a;
+    a.F = given(R::F);
+    a.J = {given_[R::J], {1, 0, 0}};
+    if (liquid || first.gradient) a.elastic_F = written(a_.elastic_row, D);
+    if (liquid || !first.gradient) a.elastic_J = {row(a_.elastic_row + D * D), {1, 0, 0}};
+    if (liquid || first.plastic) a.next_F = written(R::F, D);
+    if (!liquid) return a;
+    a.next_J = {row(R::J), {1, 0, 0}};
+    a.fraction = column(a_.fraction_row);
+    a.coherency = liquid->temperature.coherency;
+    a.stress = written(R::stress, D);
+    a.liquid_stress = field(a_.liquid_row);
+    if (a_.dissipated_row >= 0) a.dissipated = {row(a_.dissipated_row), {1, 0, 0}};
+    return a;
+  }
+
+  void add_tables(const ChunkLaw<T, D>& law, ThermalLawsArguments<T, D>& a) const {
+    for (int k = 0; k < kMostParameters; k++) {
+      const TemperatureTable<T>& table = law.temperature.parameters[k];
+      if (table.knots > 0) a.parameters[a.parameter_count++] = {table, row(law.parameters[k])};
     }
   }
 
-  // The stress of a material that melts, and its F and J where laws change them.
-  void end_thermal(const ChunkLaw<T, D>& first, const ChunkLaw<T, D>* liquid, const Members& members) const {
-    if (!liquid && !first.plastic) return;
-    for (int i = 0; i < count_; i++) {
-      if (!members.has(i)) continue;
-      const T factor = stretch_of(first, i);
-      for (int k = 0; k < D * D; k++) row(R::F + k)[i] = factor * row(a_.elastic_row + k)[i];
-      if (!liquid) continue;
-      row(R::J)[i] = volume_of_stretch<D>(factor) * row(a_.elastic_row + D * D)[i];
-      for (int k = 0; k < D * D; k++) {
-        T& stress = row(R::stress + k)[i];
-        stress = stress_of_phases(stress, row(a_.liquid_row + k)[i], row(a_.fraction_row)[i], liquid->coherency);
-      }
-    }
-  }
+  Field<const T> column(int r) const { return r < 0 ? Field<const T>{} : Field<const T>{row(r), {1, 0, 0}}; }
 
   LawUpdateArguments<T, D> here(const ChunkLaw<T, D>& law) const {
     LawUpdateArguments<T, D> u = law.arguments;
@@ -260,6 +233,8 @@ class Copies {
       if (law.history[k] >= 0) a.history[k] = field(law.history[k], law.matrix[k] ? D : 1);
     }
     u.stress = written(R::stress, D);
+    if (a_.dissipated_row >= 0 && (law.plastic || law.history[0] >= 0))
+      u.dissipated = {row(a_.dissipated_row), {1, 0, 0}};
     if (law.plastic) u.state = written(R::F, D);
     if (law.history[0] >= 0) u.history = written(law.history[0], 1);
     return u;

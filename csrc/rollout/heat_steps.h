@@ -20,8 +20,16 @@ class HeatSteps {
   static bool wanted(const SubstepsInputs& in) { return !in.heat.empty(); }
   // Of the liquid fraction in the fields, or -1.
   int liquid_column() const { return liquid_; }
+  // Of the energy that laws dissipate in the fields, or -1 where none becomes heat.
+  int dissipated_column() const { return dissipated_; }
 
   explicit HeatSteps(Substeps<T, D>& steps);
+
+  Field<const T> temperature() const { return column(fields.now(), 0); }
+  Field<const T> liquid_fraction() const { return column(fields.now(), liquid_); }
+  // Whether energy that laws dissipate becomes heat, and where they store it.
+  bool heats_by_laws() const { return dissipated_ >= 0; }
+  Field<T> dissipated() { return column(fields.next(false), dissipated_); }
 
   // Computes the present volumes; before laws change F.
   void begin(const Field<const T>& F, const Field<const T>& J, const Field<const T>& rest, backend::Stream stream) {
@@ -31,19 +39,20 @@ class HeatSteps {
     a.F = F;
     a.J = J;
     a.volume = column(fields.next(false), volume_);
+    a.dissipated = dissipated();
     backend::heat_volumes(a, stream);
   }
 
   // Computes the temperatures after a substep, with positions before it and the velocity gradient after it.
-  void run(const Field<const T>& x, const Field<const T>& mass, const Field<const T>& velocity_gradient,
-           const Field<const int>& scene, backend::Stream stream) {
+  void run(const Field<const T>& x, const Field<const T>& mass, const Field<const T>& rest,
+           const Field<const T>& velocity_gradient, const Field<const int>& scene, backend::Stream stream) {
     make_nodes(stream);
     HeatToNodesArguments<T, D> down = to_nodes(x, mass, velocity_gradient);
     backend::heat_to_nodes(in_.lattice.order(), down, stream);
     if (exchanges()) backend::clear(exchange_, stream), backend::clear(source_, stream);
     if (holds_surface()) add_layers(x, scene, stream);
     means(stream);
-    if (has_terms()) add_terms(x, stream);
+    if (has_terms()) add_terms(x, rest, stream);
     solve(x, scene, stream);
     HeatToParticlesArguments<T, D> up = to_particles(down);
     backend::heat_to_particles(in_.lattice.order(), up, stream);
@@ -57,7 +66,7 @@ class HeatSteps {
   int64_t held_nodes() const { return int64_t(in_.held_obstacles.size()) - holds_surface(); }
   // The last of the held obstacles is held at its surface, the others at the nodes in them.
   bool holds_surface() const { return in_.heat_options[2] != 0; }
-  bool has_terms() const { return !in_.heat_terms.empty() || has_power(); }
+  bool has_terms() const { return !in_.heat_terms.empty() || has_power() || heats_by_laws(); }
   // Tensors of the boundaries: held temperatures, numbers of the terms, power of the source; absent ones are empty.
   enum Boundaries : size_t { kHeld, kNumbers, kPower, kBoundaries };
   bool given(Boundaries k) const { return !in_.heat_boundaries.empty() && in_.heat_boundaries[k].numel() > 0; }
@@ -80,7 +89,7 @@ class HeatSteps {
   void check_held();
   void check_terms();
   void means(backend::Stream stream);
-  void add_terms(const Field<const T>& x, backend::Stream stream);
+  void add_terms(const Field<const T>& x, const Field<const T>& rest, backend::Stream stream);
   void add_layers(const Field<const T>& x, const Field<const int>& scene, backend::Stream stream);
   void hold_nodes(HeatArguments<T, D>& a, backend::Stream stream);
   void read_parameter(const Tensor& t, const char* name);
@@ -96,9 +105,9 @@ class HeatSteps {
 
   Substeps<T, D>& s_;
   const SubstepsInputs& in_;
-  int gradient_ = -1, liquid_ = -1, volume_ = 1;  // columns
-  std::vector<HeatValue<T>> values_;              // of the parameters; those per particle have no pointer
-  std::vector<int> own_;                          // index in `parameters`, or -1
+  int gradient_ = -1, liquid_ = -1, volume_ = 1, dissipated_ = -1;  // columns
+  std::vector<HeatValue<T>> values_;  // of the parameters; those per particle have no pointer
+  std::vector<int> own_;              // index in `parameters`, or -1
   Tensor conductance_, blend_, number_, changing_;
   Tensor largest_;                // diffusion number of a particle in each scene
   Field<const T> temperatures_;   // of the held obstacles [K, B]
@@ -116,7 +125,9 @@ HeatSteps<T, D>::HeatSteps(Substeps<T, D>& steps) : s_(steps), in_(steps.in) {
   const size_t tensors = in_.heat.size() - has_gradient();
   STD_TORCH_CHECK(tensors == 3 || tensors == 6, "heat must be 3 or 6 tensors, and the gradient, got ", in_.heat.size());
   STD_TORCH_CHECK(in_.heat_options.size() == 3, "heat_options must have 3 entries, got ", in_.heat_options.size());
-  STD_TORCH_CHECK(in_.heat_scalars.size() == 2, "heat_scalars must have 2 entries, got ", in_.heat_scalars.size());
+  STD_TORCH_CHECK(in_.heat_scalars.size() == 3, "heat_scalars must have 3 entries, got ", in_.heat_scalars.size());
+  STD_TORCH_CHECK(in_.heat_scalars[2] >= 0 && in_.heat_scalars[2] <= 1,
+                  "the share of plastic heating must be 0 to 1, got ", in_.heat_scalars[2]);
   STD_TORCH_CHECK(in_.heat_boundaries.empty() || in_.heat_boundaries.size() == kBoundaries,
                   "heat_boundaries must be empty or 3 tensors, got ", in_.heat_boundaries.size());
   STD_TORCH_CHECK(in_.heat_options[0] >= 0 && in_.heat_options[0] <= int64_t(HeatTransfer::pic),
@@ -154,6 +165,7 @@ void HeatSteps<T, D>::pack() {
   if (has_gradient()) gradient_ = columns, columns += D;
   if (in_.heat.size() >= 6) liquid_ = columns++;
   volume_ = columns++;
+  if (in_.heat_scalars[2] > 0) dissipated_ = columns++;
   Tensor packed = empty_particles(x, {P, columns});
   torch::stable::zero_(packed);
   const auto put = [&](const Tensor& t, const char* name, int first, int width) {
@@ -343,7 +355,7 @@ void HeatSteps<T, D>::check_terms() {
 
 // The terms of the free surface, and the heat from inside the matter.
 template <class T, int D>
-void HeatSteps<T, D>::add_terms(const Field<const T>& x, backend::Stream stream) {
+void HeatSteps<T, D>::add_terms(const Field<const T>& x, const Field<const T>& rest, backend::Stream stream) {
   backend::clear(surface_, stream);
   T* const sums = static_cast<T*>(surface_.data_ptr());
   HeatSurfaceArguments<T, D> down;
@@ -351,6 +363,13 @@ void HeatSteps<T, D>::add_terms(const Field<const T>& x, backend::Stream stream)
   down.x = x;
   down.volume = columns().volume;
   if (has_power()) down.power = value(power_);
+  if (heats_by_laws()) {
+    down.dissipated = column(fields.now(), dissipated_);
+    down.rest = rest;
+    down.share = in_.heat_scalars[2];
+    down.scene_dt = s_.p2g.scene_dt;
+    down.dt = in_.dt;
+  }
   down.deterministic = in_.lattice.deterministic();
   down.sums = {sums, kHeatChannels, kHeatChannels};
   backend::heat_surface(in_.lattice.order(), down, stream);
@@ -367,7 +386,7 @@ void HeatSteps<T, D>::add_terms(const Field<const T>& x, backend::Stream stream)
     backend::heat_add_term(a, stream);
   }
   a.term = HeatTerm::power;
-  if (has_power()) backend::heat_add_term(a, stream);
+  if (has_power() || heats_by_laws()) backend::heat_add_term(a, stream);
 }
 
 template <class T, int D>

@@ -8,6 +8,7 @@
 #include "rollout/schedules/block_per_scene.h"
 #include "rollout/segment_clock.h"
 #include "rollout/survey.h"
+#include "rollout/thermal_laws.h"
 
 #define MPM_ROLLOUT_KERNELS(PLAIN, ORDERED, SIZE)   \
   PLAIN(survey, SurveyArguments)                    \
@@ -25,6 +26,11 @@ MPM_BACKEND_KERNELS(MPM_ROLLOUT_KERNELS)
   PLAIN(longest_move, LongestMoveArguments)          \
   PLAIN(permute, PermuteArguments)
 MPM_BACKEND_KERNELS(MPM_SORTED_CPU_KERNELS)
+#else
+#define MPM_THERMAL_LAWS_KERNELS(PLAIN, ORDERED, SIZE) \
+  PLAIN(begin_thermal_laws, ThermalLawsArguments)      \
+  PLAIN(end_thermal_laws, ThermalLawsArguments)
+MPM_BACKEND_KERNELS(MPM_THERMAL_LAWS_KERNELS)
 #endif
 
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda

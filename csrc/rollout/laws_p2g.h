@@ -1,6 +1,6 @@
 #pragma once
 
-#include "laws/law.h"
+#include "rollout/thermal_laws.h"
 #include "transfer/arguments.h"
 
 // Laws and P2G of a substep in one pass over the particles, on the CPU. The rows that laws read of a chunk of particles
@@ -29,11 +29,10 @@ struct ChunkRows {
 // Rows of integers.
 enum ChunkNumbers : int { kOriginRow, kSceneRow, kMaterialRow, kNumberRows };
 
-// Piecewise linear function of temperature, constant beyond its ends; of one knot: a number. None: absent.
+// What a law reads of the temperature; the expansion of the material stands with its first law.
 template <class T>
-struct TemperatureTable {
-  int knots = 0;
-  const T *temperature = nullptr, *value = nullptr;
+struct LawTemperature {
+  TemperatureTable<T> parameters[kMostParameters], expansion, coherency;
 };
 
 template <class T, int D>
@@ -44,10 +43,8 @@ struct ChunkLaw {
   int material = 0;
   int history[kMostHistory], parameters[kMostParameters];  // their rows, -1 for none
   bool matrix[kMostHistory] = {};
-  TemperatureTable<T> tables[kMostParameters];  // of its parameters
-  TemperatureTable<T> expansion;                // of the material, with its first law
-  bool melts = false;                           // the liquid of a material whose solid is the law before
-  T coherency = 1;                              // with the liquid
+  LawTemperature<T> temperature;
+  bool melts = false;  // the liquid of a material whose solid is the law before
 };
 
 // Displacement of all particles, after a P2G.
@@ -74,7 +71,8 @@ struct LawsP2GArguments {
   int *index = nullptr, *schedule = nullptr;
   // Rows that laws of temperature need: temperature, liquid fraction, F and J without expansion, stress of the liquid.
   int temperature_row = -1, fraction_row = -1, elastic_row = -1, liquid_row = -1;
-  T* copies = nullptr;  // [threads, copy_size]
+  int dissipated_row = -1;  // energy that laws dissipate, where it is wanted
+  T* copies = nullptr;      // [threads, copy_size]
   int64_t copy_size = 0;
   Whereabouts* whereabouts =
       nullptr;  // receives the least budget and the number out of block, if the activation may last

@@ -292,6 +292,7 @@ bool Recorded<T, D>::run() {
     if (!memory().defined()) keeps_grids_ = steps.nodes_are_clear = false;  // all steps share the grown pool
     steps.write({x[i], v[i], C[i], F[i], J[i], residual[i], history[i]});
     if (has(in_.material)) keep_others(i);
+    steps.run_laws(stream_);
     steps.move(stream_);
     steps.end_time(stream_);
     after_substeps(in_.x.size(0), 1, stream_);

@@ -44,8 +44,9 @@ struct Substeps {
   Tensor known_nodes, known;      // see ContactArguments
   Tensor impulse, impulse_slots;  // accumulated on obstacles and walls, if wanted; see `add_impulses_to`
   bool obstacles = false, fused = false;
-  Tensor kept;                     // of FLIP, see `keep_velocities`
-  LateDeformation<T, D> late;      // of P2G, if G2P defers F or J to it
+  bool laws_are_apart = false;  // whether laws have kernels of their own: they read temperatures, or heat the particles
+  Tensor kept;                  // of FLIP, see `keep_velocities`
+  LateDeformation<T, D> late;   // of P2G, if G2P defers F or J to it
   ReorderOnScatter<T, D> reorder;  // of P2G, if the call owns the particles
   bool nodes_are_clear = false;    // when a step begins
   int used_slots = 0;              // on the CPU: number of slots with a block, if the activation counts them
@@ -200,7 +201,7 @@ struct Substeps {
 
   // Lets P2G compute the stress, if there is a kernel for it.
   void fuse(bool keeps_stress) {
-    fused = why_not_fused_law(facts).empty() && !p2g.deterministic && fused_kernels.p2g;
+    fused = why_not_fused_law(facts).empty() && !p2g.deterministic && fused_kernels.p2g && !laws_are_apart;
     if (fused && !keeps_stress) forget_stress();
   }
 
@@ -236,10 +237,20 @@ struct Substeps {
 #endif
   }
 
-  // Moves the particles; the time of the obstacles stays that of the step.
+  // Sets where laws store the energy that they dissipate, [P].
+  void dissipate(const Field<T>& to) {
+    for (size_t k = 0; k < laws.size(); k++)
+      if (calls[k].law->info.plastic || !calls[k].history.empty()) laws[k].dissipated = to;
+  }
+
+  // Computes the stress, if P2G does not.
+  void run_laws(backend::Stream stream) {
+    for (size_t k = 0; k < laws.size() && !fused; k++) calls[k].law->kernels<T, D>().update(laws[k], stream);
+  }
+
+  // Moves the particles, after their laws; the time of the obstacles stays that of the step.
   void move(backend::Stream stream) {
     if (flips()) keep_velocities(p2g, field<T>(kept), stream);
-    for (size_t k = 0; k < laws.size() && !fused; k++) calls[k].law->kernels<T, D>().update(laws[k], stream);
     move_grid(stream);
     backend::g2p_advance(in.lattice.order(), advance, stream);
     if (flips()) add_flip(field<const T>(kept), stream);

@@ -133,8 +133,6 @@ Results run(const SubstepsInputs& in) {
   check_positions(x);
   STD_TORCH_CHECK(in.heat.empty() || (!in.records && in.resident),
                   "heat is computed without gradients: records must be false, and resident true");
-  STD_TORCH_CHECK(x.is_cpu() || (in.thermal.empty() && in.laws.find('~') == std::string::npos),
-                  "laws of temperature are computed on the CPU");
   const DeviceScope device(x);
   if (in.records && !has(in.impulse) && x.size(0) > 0) {
     std::optional<Results> recorded;

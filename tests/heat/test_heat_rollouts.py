@@ -347,7 +347,6 @@ REFUSED = {
         s, *[(heat_boundaries.FixedSurface, mpm.Sphere((0.4, 0.4), r), 1.0) for r in (0.1, 0.2)]
     ),
     "its heat is solved by multigrid": lambda s: setattr(s.heat, "method", "multigrid"),
-    "the law dissipates energy into heat": lambda s: setattr(s.heat, "plastic_heating", 0.5),
     "another stress form than mls": lambda s: setattr(s, "stress_form", "gradient"),
     "a parameter of its heat is a function": _of_function,
     "its heat has another grid": lambda s: setattr(s.heat, "grid", mpm.Grid(0.1, (0.0, 0.0), (1.0, 1.0))),
@@ -385,19 +384,20 @@ THERMAL = {
 }
 
 
-def thermal(names, dim=3, dtype=torch.float64, scenes=1, **options):
+def thermal(names, dim=3, dtype=torch.float64, scenes=1, device="cpu", **options):
     """A scene of laws that read the temperature, of each or of a mixture."""
     step, state = scene(dim, dtype, scenes, melts=True, **options)
     laws = [THERMAL[name]() if name in THERMAL else named(name)[name]() for name in names]
     step.law = laws[0] if len(laws) == 1 else mpm.Mixture(laws)
     material = (torch.arange(len(state)) % len(laws)).int() if len(laws) > 1 else None
     liquid = {"liquid": torch.rand(len(state), generator=torch.Generator().manual_seed(2)).to(dtype)}
-    return step, step.prepare(state.replace(F=None, J=None, material=material, extra=state.extra | liquid))
+    state = state.replace(F=None, J=None, material=material, extra=state.extra | liquid)
+    return step.to(device), step.prepare(state.to(device=device))
 
 
 @pytest.mark.parametrize("name", THERMAL)
-def test_laws_that_read_the_temperature(dim, name):
-    step, state = thermal([name], dim)
+def test_laws_that_read_the_temperature(dim, name, device):
+    step, state = thermal([name], dim, device=device)
     end = compare(step, state)
     with torch.no_grad():
         cold = composed(step, state.replace(temperature=state.temperature - 1.0), 12, DT)
@@ -407,30 +407,72 @@ def test_laws_that_read_the_temperature(dim, name):
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_random_laws_that_read_the_temperature(seed):
+def test_random_laws_that_read_the_temperature(seed, device):
     """Mixtures x transfers x kernels x batches x time steps x schedules, in both dtypes."""
     r = random.Random(100 + seed)
     scenes, dtype = r.choice((1, 3)), r.choice((torch.float32, torch.float64))
     names = r.sample([*THERMAL, *LAWS], r.choice((1, 2, 4)))
     step, state = thermal(
         names, r.choice((2, 3)), dtype, scenes, kernel=r.choice(("quadratic", "cubic")),
-        transfer=r.choice(TRANSFERS), flip=r.choice((0.0, 0.4)), deterministic=r.choice((True, False)),
+        transfer=r.choice(TRANSFERS), flip=r.choice((0.0, 0.4)), deterministic=r.choice((True, False)), device=device,
     )  # fmt: skip
     dt = torch.linspace(1, 2, scenes, dtype=dtype) * DT if r.random() < 0.5 else DT
-    schedule = r.choice((None, "per_step", "sorted_cpu"))
+    schedule = r.choice((None, "per_step", "sorted_cpu" if device == "cpu" else None))
     compare(step, state, r.choice((2, 9, 25)), dt, schedule, 1e-8 if dtype == torch.float64 else 3e-3)
 
 
-def test_one_particle_reads_its_temperature():
-    step, state = thermal(["softening"])
-    compare(step, step.prepare(state.select(torch.tensor([5]))))
+FLOWING = ("von_mises", "sand", "viscoelastic", "snow", "cam_clay", "herschel_bulkley")
 
 
-def test_temperatures_beyond_the_knots():
+@pytest.mark.parametrize("with_source", [False, True])
+@pytest.mark.parametrize("name", [*FLOWING, "melting and flow", "expansion and flow", "mixture"])
+def test_plastic_heating(dim, name, with_source, device):
+    """Energy that laws dissipate becomes heat, alone and beside a source."""
+    names = ["von_mises", "melting and flow", "neo_hookean", "sand"] if name == "mixture" else [name]
+    ends = []
+    for share in (0.9, 0.0):
+        step, state = thermal(names, dim, scenes=2, device=device)
+        step.heat.plastic_heating = share
+        if with_source:
+            step.heat.boundaries = [heat_boundaries.Source(2e8)]
+        dt = torch.tensor([1.0, 2.0], dtype=torch.float64) * DT
+        state = state.replace(v=40 * (state.x - 0.45).flip(1))  # shear
+        ends.append(compare(step, step.prepare(state), 9, dt))
+    assert float((ends[0].temperature - ends[1].temperature).max()) > 1e-9
+
+
+def test_plastic_heating_in_float32(device):
+    """With one law, whose stress is else computed in P2G on CUDA."""
+    step, state = thermal(["von_mises"], dtype=torch.float32, device=device)
+    step.heat.plastic_heating = 0.9
+    compare(step, step.prepare(state.replace(v=40 * (state.x - 0.45).flip(1))), 20, tolerance=1e-3)
+
+
+def test_one_particle_reads_its_temperature(device):
+    step, state = thermal(["softening"], device=device)
+    compare(step, step.prepare(state.select(torch.tensor([5], device=device))))
+
+
+@pytest.mark.parametrize("change", ["in place", "through data", "assigned"])
+def test_tables_that_change_between_calls(change, device):
+    """Their contents are compared; so is what a law has beside them."""
+    step, state = thermal(["softening"], 2, device=device)
+    step.law.E = Table(SOFTENING.temperature, SOFTENING.value.clone()).to(device)
+    first = compare(step, state).v
+    if change == "in place":
+        step.law.E.value[1] = 2e5
+    elif change == "through data":
+        step.law.E.value.data[1] = 2e5
+    else:
+        step.law.nu = 0.45
+    assert relative_error(compare(step, state).v, first) > 1e-6
+
+
+def test_temperatures_beyond_the_knots(device):
     """And at knots; a law of one temperature is that of numbers."""
     ends = []
     for E in (Table([100.0, 101.0], [1e5, 2e5]), Table([-3.0, -2.0], [2e5, 1e5]), 1e5):
-        step, state = thermal(["softening"])
+        step, state = thermal(["softening"], device=device)
         step.law = mpm.NeoHookean(E=E, nu=0.3)
         ends.append(compare(step, state).v)
     for end in ends[:2]:
@@ -485,9 +527,10 @@ def test_raw_op():
         "heat.0. must have shape": {"heat": [heat[0][1:], *heat[1:]]},
         "the temperature gradient must have shape": {"heat": [*heat[:-1], state.x[1:]]},
         "heat_options must have 3 entries, got 2": {"heat_options": [0, 1]},
-        "heat_scalars must have 2 entries, got 1": {"heat_scalars": [0.5]},
+        "heat_scalars must have 3 entries, got 1": {"heat_scalars": [0.5]},
+        "share of plastic heating must be 0 to 1, got 2": {"heat_scalars": [0.5, 0.0, 2.0]},
         "transfer of heat must be 0 to 3, got 4": {"heat_options": [4, 9, 0]},
-        "tolerance must be between 0 and 1": {"heat_scalars": [1.0, 0.0]},
+        "tolerance must be between 0 and 1": {"heat_scalars": [1.0, 0.0, 0.0]},
         "iterations must be positive": {"heat_options": [0, 0, 0]},
         "heat needs wants_C": {"wants_C": False, "apic": False},
         "without gradients": {"resident": False},

@@ -213,14 +213,9 @@ def test_examples_build_and_name_their_plan(path):
     dt, substeps = time_step(scene, built, state)
     headline, *others = plan_in_words(scene, built, state.sorted(built.grid), dt, substeps).items()
     executors, schedules = {"fused", "replay", "graph", "loop"}, set(SCHEDULES)
-    if path.stem != "friction_heat":
-        chosen = {"fused", "sorted_cpu"}
-        assert "(executor fused, schedule sorted_cpu)" in headline[1]
-    else:
-        chosen = {"loop", *schedules}  # Schedules are those of the fused op.
-        assert headline[1].startswith("step by step, because the law dissipates energy into heat")
+    assert "(executor fused, schedule sorted_cpu)" in headline[1]
     assert headline[0] == "plan" and {name for name, _ in others} == {
-        f"not {name}" for name in (executors | schedules) - chosen
+        f"not {name}" for name in (executors | schedules) - {"fused", "sorted_cpu"}
     }
     assert all(len(reason) > 10 for _, reason in others)
 

@@ -89,12 +89,12 @@ def law_calls(law: Material, state: Any, dt: float | Tensor | None = None, heate
         solid: CompiledLaw = phases.solid  # type: ignore[assignment]
         liquid: CompiledLaw | None = phases.liquid  # type: ignore[assignment]
         names.append(add(solid))
-        add_tables(tables_of_parameters(solid, state.x.shape[1]))
+        add_tables(tables_of_parameters(solid, state.x))
         add_tables(tables_of_expansion(phases.expansion))
         history_names.append(solid.history_names())
         if liquid is not None:
             names[-1] += f"~{add(liquid)}"
-            add_tables(tables_of_parameters(liquid, state.x.shape[1]))
+            add_tables(tables_of_parameters(liquid, state.x))
             add_tables([(COHERENCY, state.x.new_tensor([[0.0], [phases.coherency]]))])
     return LawCalls(
         ",".join(names),

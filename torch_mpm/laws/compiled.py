@@ -72,6 +72,7 @@ class CompiledLaw(Material):
     def __init__(self) -> None:
         super().__init__()
         self._kept_parameters, self._kept_scalars = DeviceConstantCache(), DeviceConstantCache()
+        self._kept_tables = DeviceConstantCache()
         self._functions = False
 
     def __setattr__(self, name: str, value: Any) -> None:

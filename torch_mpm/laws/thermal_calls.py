@@ -51,7 +51,7 @@ def is_thermal(law: Material) -> bool:
 
 
 Tables = list[tuple[int, Tensor]]
-"""Numbers of parameters, `EXPANSION` or `COHERENCY`, with knots and values [2, K] in float64."""
+"""Numbers of parameters, `EXPANSION` or `COHERENCY`, with knots and values [2, K]."""
 
 
 def tables_of_expansion(coefficient: Any) -> Tables | None:
@@ -66,17 +66,26 @@ def tables_of_expansion(coefficient: Any) -> Tables | None:
     return [(EXPANSION, torch.stack([number.new_zeros(1), number.reshape(1)]))] if number.numel() == 1 else None
 
 
-@torch.no_grad()
-def tables_of_parameters(law: CompiledLaw, dim: int) -> Tables | None:
-    """Tables of the parameters of a compiled law that depend on the temperature; None where one is not piecewise
-    linear, or others differ between particles or scenes."""
+def tables_of_parameters(law: CompiledLaw, x: Tensor) -> Tables | None:
+    """Tables of the parameters of a compiled law that depend on the temperature, for particles at x [P, D]; None where
+    one is not piecewise linear, or others differ between particles or scenes. Cached while nothing has changed."""
     if not law.has_functions:
         return []
-    given = [(name, value) for name, value in law._stored() if law._range(name) is not None]
-    functions = [value for _, value in given if callable(value) and not isinstance(value, Tensor)]
-    others = [value for _, value in given if isinstance(value, Tensor)]
+    given = [value for name, value in law._stored() if law._range(name) is not None]
+    functions = [value for value in given if callable(value) and not isinstance(value, Tensor)]
+    others = [value for value in given if isinstance(value, Tensor)]
     if any([type(f) is not Table for f in functions]) or any([value.numel() > 1 for value in others]):
         return None
+    numbers = [value for value in given if isinstance(value, (float, int))]
+    contents = [tensor for f in functions for tensor in (f.temperature, f.value)]
+    key = (x.dtype, x.device, x.shape[1], *numbers, *others, *contents)
+    return law._kept_tables.get(key, lambda: _tables_of_functions(law, functions, x), x)
+
+
+@torch.no_grad()
+def _tables_of_functions(law: CompiledLaw, functions: list[Table], x: Tensor) -> Tables | None:
+    """Tables of parameters that are computed from functions; None where one is not linear between their knots."""
+    dim = x.shape[1]
     knots = torch.cat([f.temperature.double().cpu() for f in functions]).unique()
     middles = (knots[1:] + knots[:-1]) / 2
     points = torch.cat([knots, middles])
@@ -92,18 +101,18 @@ def tables_of_parameters(law: CompiledLaw, dim: int) -> Tables | None:
         error = (between - (at_knots[1:] + at_knots[:-1]) / 2).abs().max()
         if not float(error) <= 1e-12 * float(values.abs().max()):
             return None
-        tables.append((number, torch.stack([knots, at_knots])))
+        tables.append((number, torch.stack([knots, at_knots]).to(x)))
     return tables
 
 
-def why_not_thermal(law: Material, dim: int, melts: bool) -> str | None:
-    """Reason why the fused op does not compute a law that reads the temperature; None if it does. `melts`: whether the
-    heat of the step computes liquid fractions."""
+def why_not_thermal(law: Material, x: Tensor, melts: bool) -> str | None:
+    """Reason why the fused op does not compute a law that reads the temperature, for particles at x; None if it does.
+    `melts`: whether the heat of the step computes liquid fractions."""
     phases = phases_of(law)
     if phases.liquid is not None and not melts:
         return "a law melts, and the heat has no melting point"
     if tables_of_expansion(phases.expansion) is None:
         return "an expansion is neither one number nor a table"
-    if any([tables_of_parameters(part, dim) is None for part in laws_in(law)]):  # type: ignore[arg-type]
+    if any([tables_of_parameters(part, x) is None for part in laws_in(law)]):  # type: ignore[arg-type]
         return "a parameter of the law is a function, and its heat changes the temperature"
     return None

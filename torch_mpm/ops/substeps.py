@@ -28,7 +28,8 @@ Heat is conducted where `heat` is not empty, without gradients: temperature [P],
 specific heat; for materials that melt also liquid fraction [P], melting point and latent heat; and last, for the first
 two numbers in `TRANSFERS` of torch_mpm.heat, the temperature gradient [P, D]. Parameters are [], [1], [B] or [P].
 `heat_options` are the number of the transfer, the maximum number of iterations, and whether the last of the
-`held_obstacles` holds its surface (1) instead of the nodes in it; `heat_scalars` are tolerance and reference [K].
+`held_obstacles` holds its surface (1) instead of the nodes in it; `heat_scalars` are tolerance, reference [K]
+and the share of the dissipated energy that becomes heat.
 `heat_terms` of the free surface are 0 for a flux, 1 for convection and 2 for radiation. `heat_boundaries` are the
 temperatures of the held obstacles [K, B], two numbers of each term [K, B, 2] (flux, coefficient or emissivity times the
 constant of Stefan and Boltzmann; and ambient temperature), and the power of a source [W/m³]; absent ones have the shape
@@ -130,9 +131,9 @@ def _fake(
 
 
 def _columns_of_heat(given: dict[str, Any], dim: int) -> int:
-    """Temperature, gradient, liquid fraction and present volume."""
+    """Temperature, gradient, liquid fraction, present volume and dissipated energy."""
     count = len(given["heat"])
-    return 2 + (dim if count % 3 == 1 else 0) + (count >= 6)
+    return 2 + (dim if count % 3 == 1 else 0) + (count >= 6) + (given["heat_scalars"][2] > 0)
 
 
 def _fake_record(x: Tensor) -> Tensor:

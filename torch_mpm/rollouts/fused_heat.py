@@ -38,8 +38,6 @@ def why_not_fused_heat(step: Step, state: State, n: int, dt: float | Tensor) -> 
         return reason
     if heat.method != "cg":
         return f"its heat is solved by {heat.method}"
-    if heat.plastic_heating:
-        return "the law dissipates energy into heat"
     if step.stress_form != "mls":
         return "it conducts heat with another stress form than mls"
     values = _values(heat)
@@ -180,7 +178,7 @@ def heat_arguments(step: Step, state: State) -> tuple[Any, ...]:
     options = [TRANSFERS.index(heat.transfer), heat.max_iterations, surface]
     boundaries = [temperatures, of_terms, power] if heat.boundaries.entries else []
     tensors = [temperature, *values[:2], *melting, *gradient]
-    return tensors, options, [heat.tolerance, heat.reference], numbers, terms, boundaries
+    return tensors, options, [heat.tolerance, heat.reference, heat.plastic_heating], numbers, terms, boundaries
 
 
 def heat_changes(heat: Heat, state: State, packed: Tensor, status: Tensor) -> tuple[Tensor, dict[str, Tensor]]:

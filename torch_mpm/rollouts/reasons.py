@@ -88,9 +88,9 @@ def _why_not_heated(step: Step, x: Tensor) -> str | None:
     thermal = [law for law in laws if is_thermal(passive(law))]
     if any([law is not passive(law) for law in thermal]):
         return "a law with muscles reads the temperature"
-    if thermal and x.is_cuda:
-        return "a law reads the temperature, on a CUDA device"
-    return next(filter(None, (why_not_thermal(law, x.shape[1], step.heat.melts) for law in thermal)), None)
+    if thermal and is_captured(x):
+        return "a law reads the temperature, and the host computes its tables"
+    return next(filter(None, (why_not_thermal(law, x, step.heat.melts) for law in thermal)), None)
 
 
 def _why_not_eager(x: Tensor) -> str | None:

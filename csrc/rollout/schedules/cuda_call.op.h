@@ -6,6 +6,7 @@
 #include "rollout/schedules/block_per_scene.op.h"
 #include "rollout/schedules/fused_g2p2g.op.h"
 #include "rollout/schedules/persistent.op.h"
+#include "rollout/thermal_laws.op.h"
 
 // A call of many substeps on CUDA without a record: its results, and a function for each schedule.
 namespace mpm {
@@ -33,6 +34,8 @@ class CudaCall {
     s_.facts.graph_loops = !loops_are_refused;
     schedule_ = schedule_of(in_.schedule, s_.facts);
     if (HeatSteps<T, D>::wanted(in_)) heat_.emplace(s_);
+    if (ThermalLaws<T, D>::wanted(s_)) thermal_.emplace(s_, heat_ ? &*heat_ : nullptr);
+    s_.laws_are_apart = thermal_ || (heat_ && heat_->heats_by_laws());
   }
 
   // The schedule of the call; after run(), that of its last substeps.
@@ -64,6 +67,7 @@ class CudaCall {
   Tensor status_[2], history_, impulse_, time_;
   Substeps<T, D> s_;
   std::optional<HeatSteps<T, D>> heat_;
+  std::optional<ThermalLaws<T, D>> thermal_;
   Schedule schedule_;
   Particles<const T> from_;      // inputs of the next substep
   const int* before_ = nullptr;  // status before it
@@ -115,10 +119,14 @@ class CudaCall {
     late_ = s_.moves_late();
     x_[1] = result(in_.x, several, {P(), D});
     F_[1] = late_ ? F_[0] : result(in_.x, has(in_.F) && (several || s_.plastic), {P(), D, D});
-    J_[1] = late_ ? J_[0] : result(in_.x, has(in_.J) && several, {P()});
+    J_[1] = late_ ? J_[0] : result(in_.x, has(in_.J) && (several || s_.melts), {P()});
     if (s_.plastic && has(in_.F) && !late_) {  // laws change it in place
       torch::stable::copy_(F_[1], *in_.F);
       from_.F = field<const T>(F_[1]);
+    }
+    if (s_.melts) {
+      torch::stable::copy_(J_[1], *in_.J);
+      from_.J = field<const T>(J_[1]);
     }
   }
 
@@ -128,13 +136,16 @@ class CudaCall {
     s_.read(from_, field<T>(F_[1 - into]));
     const Particles<T> to = buffers(into);
     s_.write(to);
+    if (heat_ && heat_->heats_by_laws()) s_.dissipate(heat_->dissipated());
+    if (thermal_) thermal_->read(field<T>(F_[1 - into]), field<T>(J_[1 - into]));
     if (late_) s_.move_late(to, step_ > 0, last);
     s_.activate(before_, status(into), on);
     if (heat_) heat_->begin(from_.F, from_.J, s_.p2g.volume, on);
+    thermal_ ? thermal_->run(on) : s_.run_laws(on);
     s_.move(on);
     if (heat_) {
       const Field<const int> scene{s_.activation.scene, {s_.activation.scene_stride}};
-      heat_->run(from_.x, s_.p2g.mass, constant(to.C), scene, on);
+      heat_->run(from_.x, s_.p2g.mass, s_.p2g.volume, constant(to.C), scene, on);
     }
     s_.end_time(on);
     before_ = status(into);

@@ -4,14 +4,11 @@
 #include <utility>
 
 #include "cpu/schedule.h"
-#include "rollout/heat_steps.h"
 #include "rollout/own_field.h"
 #include "rollout/step_kernels.h"
+#include "rollout/thermal_laws.op.h"
 
 namespace mpm {
-
-// What a table gives in the place of the number of a parameter: the expansion of a material, the coherency of a liquid.
-constexpr int64_t kExpansion = -1, kCoherency = -2;
 
 // The particles of a call on the CPU. They move in place and are reordered by cell from time to time, so that packs of
 // particles are loads and stores of whole registers. At the end they are restored to the given order.
@@ -54,13 +51,7 @@ class SortedCpu {
   double farthest() const;
   void find_laws();
   void find_thermal();
-  TemperatureTable<T> table(int64_t number) const;
-  bool has_table(int64_t law, int parameter) const {
-    for (size_t r = 0; r + 2 < in_.thermal.size(); r += 3)
-      if (in_.thermal[r] == law && in_.thermal[r + 1] == parameter) return true;
-    return false;
-  }
-  void read_column(int column, int row);
+  void find_column(int column, int row, bool written);
   void keep_velocities();
   bool begin(const int* status_before, int* status, int64_t following);
   void run_substep(const int* status_before, int* status);
@@ -166,10 +157,12 @@ double SortedCpu<T, D>::farthest() const {
 
 template <class T, int D>
 void SortedCpu<T, D>::find_laws() {
+  const std::vector<LawTemperature<T>> temperatures = temperatures_of_laws<T>(in_, s_.calls);
   for (size_t k = 0; k < s_.laws.size(); k++) {
     const LawCall& call = s_.calls[k];
     const LawInfo& info = call.law->info;
     ChunkLaw<T, D> law;
+    law.temperature = temperatures[k];
     law.update = call.law->template kernels<T, D>().update;
     law.arguments = s_.laws[k];
     law.gradient = info.field == Deformation::gradient;
@@ -188,7 +181,7 @@ void SortedCpu<T, D>::find_laws() {
     for (int i = 0; i < kMostParameters; i++) {
       const Parameter<T>& p = law.arguments.law.parameters[i];
       law.parameters[i] = -1;
-      if (has_table(int64_t(k), i) || !p.pointer || p.stride == 0 || p.scenes > 0) continue;
+      if (law.temperature.parameters[i].knots > 0 || !p.pointer || p.stride == 0 || p.scenes > 0) continue;
       law.parameters[i] = parameter_row(parameters_.size());
       parameters_.push_back({in_.x, {p.pointer, {p.stride, 0, 0}}, {in_.x.size(0)}});
     }
@@ -199,54 +192,29 @@ void SortedCpu<T, D>::find_laws() {
   find_thermal();
 }
 
-// What laws need of the temperature, and the rows for it. Records of the call: a law, the number of a parameter,
-// kExpansion or kCoherency, and the number of a table.
+// The rows that laws need for the temperature.
 template <class T, int D>
 void SortedCpu<T, D>::find_thermal() {
-  STD_TORCH_CHECK(in_.thermal.size() % 3 == 0, "thermal must have records of 3 numbers, got ", in_.thermal.size());
   bool reads_temperature = false, expands = false;
-  for (size_t r = 0; r < in_.thermal.size(); r += 3) {
-    const int64_t k = in_.thermal[r], what = in_.thermal[r + 1];
-    STD_TORCH_CHECK(k >= 0 && k < int64_t(laws_.size()), "thermal must name laws 0 to ", laws_.size() - 1, ", got ", k);
-    ChunkLaw<T, D>& law = laws_[size_t(k)];
-    STD_TORCH_CHECK(what >= kCoherency && what < int64_t(s_.calls[size_t(k)].parameters.size()),
-                    "thermal must name parameters of a law, got ", what);
-    const TemperatureTable<T> own = table(in_.thermal[r + 2]);
-    if (what == kCoherency) {
-      law.coherency = own.value[0];
-      continue;
+  for (ChunkLaw<T, D>& law : laws_) {
+    for (int i = 0; i < kMostParameters; i++) {
+      if (law.temperature.parameters[i].knots == 0) continue;
+      law.parameters[i] = copied_rows_++;
+      reads_temperature = true;
     }
-    reads_temperature = true;
-    expands |= what == kExpansion;
-    (what == kExpansion ? law.expansion : law.tables[what]) = own;
-    if (what >= 0) law.parameters[what] = copied_rows_++;
+    expands |= law.temperature.expansion.knots > 0;
   }
-  STD_TORCH_CHECK((!reads_temperature && !s_.melts) || heat, "laws of temperature need heat");
-  STD_TORCH_CHECK(!s_.melts || heat->liquid_column() >= 0, "a material that melts needs heat with a melting point");
-  if (reads_temperature) a_.temperature_row = copied_rows_++;
+  if (reads_temperature || expands) a_.temperature_row = copied_rows_++;
   if (s_.melts) a_.fraction_row = copied_rows_++;
   const auto rows = [this](int count) { return std::exchange(copied_rows_, copied_rows_ + count); };
   if (s_.melts || expands) a_.elastic_row = rows(D * D + 1);
   if (s_.melts) a_.liquid_row = rows(D * D);
+  if (heat && heat->dissipated_column() >= 0) a_.dissipated_row = copied_rows_++;
 }
 
+// Copies a column of heat to a row, and back if it is written.
 template <class T, int D>
-TemperatureTable<T> SortedCpu<T, D>::table(int64_t number) const {
-  STD_TORCH_CHECK(number >= 0 && number < int64_t(in_.tables.size()), "tables must have an entry ", number, ", got ",
-                  in_.tables.size());
-  const Tensor& t = in_.tables[size_t(number)];
-  const int64_t knots = t.dim() == 2 ? t.size(1) : 0;
-  STD_TORCH_CHECK(knots > 0, "tables must have shape [2, K], got ", shape_of(t));
-  check_shape(t, element("tables", int(number)).c_str(), {2, knots});
-  check_like(t, element("tables", int(number)).c_str(), in_.x);
-  STD_TORCH_CHECK(t.is_contiguous(), "tables must be contiguous");
-  const T* const values = static_cast<const T*>(t.data_ptr());
-  return {int(knots), values, values + knots};
-}
-
-// Copies a column of heat to a row.
-template <class T, int D>
-void SortedCpu<T, D>::read_column(int column, int row) {
+void SortedCpu<T, D>::find_column(int column, int row, bool written) {
   if (row < 0) return;
   const Field<const T>& fields = heat->fields.now();
   const T* const from = fields.pointer + column * fields.stride[1];
@@ -255,7 +223,8 @@ void SortedCpu<T, D>::read_column(int column, int row) {
       r.row = row;
       return;
     }
-  rows_.push_back({from, fields.stride[0], nullptr, row});
+  T* const to = written ? heat->fields.next(false).pointer + column * fields.stride[1] : nullptr;
+  rows_.push_back({from, fields.stride[0], to, row});
 }
 
 // A break in the order of the particles costs every substep about as much as a particle; reordering a particle costs a
@@ -388,8 +357,9 @@ void SortedCpu<T, D>::find_rows(bool rearranges) {
   for_fields([&](OwnField<T>& f, int row, bool read, bool changes) {
     if (read || rearranges) f.rows(rows_, row, changes || rearranges, rearranges);
   });
-  read_column(0, a_.temperature_row);
-  if (a_.fraction_row >= 0) read_column(heat->liquid_column(), a_.fraction_row);
+  find_column(0, a_.temperature_row, false);
+  if (heat) find_column(heat->liquid_column(), a_.fraction_row, false);
+  if (heat) find_column(heat->dissipated_column(), a_.dissipated_row, true);
   if (viscous_ && C.now().pointer) C.rows(rows_, R::C, false, false);
   if (rearranges && s_.flips()) kept_.rows(rows_, -1, true, true);
   if (rearranges) origin_.rows(numbers_, kOriginRow, true, true);
@@ -476,7 +446,7 @@ void SortedCpu<T, D>::advance() {
     set_advance();
     backend::g2p_advance(in_.lattice.order(), s_.advance, stream_);
     if (s_.flips()) s_.add_flip(kept_.now(), stream_);
-    if (heat) heat->run(x.now(), mass_.now(), constant(s_.advance.gather.moment), scene_.now(), stream_);
+    if (heat) heat->run(x.now(), mass_.now(), volume_.now(), constant(s_.advance.gather.moment), scene_.now(), stream_);
   }
   moved_ |= heat.has_value();
   v.go(false);

@@ -1,0 +1,148 @@
+#pragma once
+
+#include "rollout/heat_steps.h"
+#include "rollout/thermal_laws.h"
+
+// Laws of temperature in a call of many substeps: their tables, and on CUDA their buffers and kernels.
+namespace mpm {
+
+// What a table gives in the place of the number of a parameter: the expansion of a material, the coherency of a liquid.
+constexpr int64_t kExpansion = -1, kCoherency = -2;
+
+template <class T>
+TemperatureTable<T> temperature_table(const SubstepsInputs& in, int64_t number) {
+  STD_TORCH_CHECK(number >= 0 && number < int64_t(in.tables.size()), "tables must have an entry ", number, ", got ",
+                  in.tables.size());
+  const Tensor& t = in.tables[size_t(number)];
+  const int64_t knots = t.dim() == 2 ? t.size(1) : 0;
+  STD_TORCH_CHECK(knots > 0, "tables must have shape [2, K], got ", shape_of(t));
+  check_shape(t, element("tables", int(number)).c_str(), {2, knots});
+  check_like(t, element("tables", int(number)).c_str(), in.x);
+  STD_TORCH_CHECK(t.is_contiguous(), "tables must be contiguous");
+  const T* const values = static_cast<const T*>(t.data_ptr());
+  return {int(knots), values, values + knots};
+}
+
+// What each law reads of the temperature. Records of the call: a law, the number of a parameter, kExpansion or
+// kCoherency, and the number of a table.
+template <class T>
+std::vector<LawTemperature<T>> temperatures_of_laws(const SubstepsInputs& in, const std::vector<LawCall>& calls) {
+  std::vector<LawTemperature<T>> laws(calls.size());
+  STD_TORCH_CHECK(in.thermal.size() % 3 == 0, "thermal must have records of 3 numbers, got ", in.thermal.size());
+  for (size_t r = 0; r < in.thermal.size(); r += 3) {
+    const int64_t k = in.thermal[r], what = in.thermal[r + 1];
+    STD_TORCH_CHECK(k >= 0 && k < int64_t(laws.size()), "thermal must name laws 0 to ", laws.size() - 1, ", got ", k);
+    LawTemperature<T>& law = laws[size_t(k)];
+    STD_TORCH_CHECK(what >= kCoherency && what < int64_t(calls[size_t(k)].parameters.size()),
+                    "thermal must name parameters of a law, got ", what);
+    TemperatureTable<T>& table = what == kExpansion   ? law.expansion
+                                 : what == kCoherency ? law.coherency
+                                                      : law.parameters[what];
+    table = temperature_table<T>(in, in.thermal[r + 2]);
+  }
+  bool melts = false;
+  for (size_t k = 0; k < calls.size(); k++) {
+    melts |= calls[k].melts;
+    STD_TORCH_CHECK(calls[k].melts == (laws[k].coherency.knots > 0),
+                    "a law must have a coherency where it is that of a liquid, got law ", k);
+  }
+  STD_TORCH_CHECK((in.thermal.empty() && !melts) || !in.heat.empty(), "laws of temperature need heat");
+  STD_TORCH_CHECK(!melts || in.heat.size() >= 6, "a material that melts needs heat with a melting point");
+  return laws;
+}
+
+#if MPM_BACKEND == MPM_BACKEND_IS_cuda
+
+// The laws of a call kernel by kernel, with buffers for what they read in place of the fields of the particles.
+template <class T, int D>
+class ThermalLaws {
+ public:
+  static bool wanted(const Substeps<T, D>& s) { return !s.in.thermal.empty() || s.melts; }
+
+  // `heat` must be there.
+  ThermalLaws(Substeps<T, D>& steps, const HeatSteps<T, D>* heat) : s_(steps), heat_(heat) {
+    const int64_t P = s_.in.x.size(0);
+    const std::vector<LawTemperature<T>> laws = temperatures_of_laws<T>(s_.in, s_.calls);
+    materials_.resize(laws.size());
+    for (size_t k = 0; k < laws.size(); k++) {
+      const bool melts = s_.calls[k].melts;
+      ThermalLawsArguments<T, D>& a = materials_[melts ? k - 1 : k];
+      a.particles = P;
+      a.members = s_.laws[k].law.members;
+      for (int i = 0; i < kMostParameters; i++)
+        if (laws[k].parameters[i].knots > 0) add_parameter(a, s_.laws[k].law.parameters[i], laws[k].parameters[i]);
+      if (!melts) a.expansion = laws[k].expansion;
+      if (melts) a.coherency = laws[k].coherency;
+    }
+    for (size_t k = 0; k < laws.size(); k++) make_buffers(k);
+  }
+
+  // Replaces the settings of Substeps::read and Substeps::write for these laws. Laws change `F` and `J` in place.
+  void read(const Field<T>& F, const Field<T>& J) {
+    for (size_t k = 0; k < materials_.size(); k++) {
+      if (s_.calls[k].melts) continue;
+      ThermalLawsArguments<T, D>& a = materials_[k];
+      a.theta = heat_->temperature();
+      if (has_liquid(k)) a.fraction = heat_->liquid_fraction();
+      if (!a.has_elastic()) continue;
+      (s_.calls[k].law->info.field == Deformation::gradient ? a.F : a.J) = s_.laws[k].law.state;
+      if (has_liquid(k)) a.J = constant(J), a.dissipated = s_.laws[k].dissipated;
+      if (has_liquid(k) || s_.calls[k].law->info.plastic) a.next_F = F;
+      if (has_liquid(k)) a.next_J = J;
+      read_elastic(k, a);
+      if (has_liquid(k)) read_elastic(k + 1, a);
+    }
+  }
+
+  void run(backend::Stream stream) const {
+    for (size_t k = 0; k < materials_.size(); k++) {
+      const ThermalLawsArguments<T, D>& a = materials_[s_.calls[k].melts ? k - 1 : k];
+      if (!s_.calls[k].melts && a.begins()) backend::begin_thermal_laws(a, stream);
+      s_.calls[k].law->template kernels<T, D>().update(s_.laws[k], stream);
+      if (!has_liquid(k) && a.ends()) backend::end_thermal_laws(a, stream);
+    }
+  }
+
+ private:
+  bool has_liquid(size_t k) const { return k + 1 < s_.calls.size() && s_.calls[k + 1].melts; }
+
+  void add_parameter(ThermalLawsArguments<T, D>& a, Parameter<T>& p, const TemperatureTable<T>& table) {
+    buffers_.push_back(empty(s_.in.x, {a.particles}));
+    T* const to = static_cast<T*>(buffers_.back().data_ptr());
+    a.parameters[a.parameter_count++] = {table, to};
+    p = {to, 1, 0};
+  }
+
+  Field<T> buffer(const Shape& shape) {
+    buffers_.push_back(empty_particles(s_.in.x, shape));
+    return field<T>(buffers_.back());
+  }
+
+  void make_buffers(size_t k) {
+    ThermalLawsArguments<T, D>& a = materials_[k];
+    if (s_.calls[k].melts || (!has_liquid(k) && a.expansion.knots == 0)) return;
+    const bool gradient = s_.calls[k].law->info.field == Deformation::gradient;
+    if (gradient) a.elastic_F = buffer({a.particles, D, D});
+    if (!gradient || has_liquid(k)) a.elastic_J = buffer({a.particles});
+    if (!has_liquid(k)) return;
+    a.stress = s_.laws[k].stress;
+    const Field<T> liquid = s_.laws[k + 1].stress = buffer({a.particles, D, D});
+    a.liquid_stress = constant(liquid);
+  }
+
+  void read_elastic(size_t k, const ThermalLawsArguments<T, D>& a) {
+    const LawInfo& info = s_.calls[k].law->info;
+    const Field<T>& own = info.field == Deformation::gradient ? a.elastic_F : a.elastic_J;
+    s_.laws[k].law.state = constant(own);
+    if (info.plastic) s_.laws[k].state = own;
+  }
+
+  Substeps<T, D>& s_;
+  const HeatSteps<T, D>* const heat_;
+  std::vector<ThermalLawsArguments<T, D>> materials_;  // with their first law
+  Tensors buffers_;
+};
+
+#endif
+
+}  // namespace mpm
