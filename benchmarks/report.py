@@ -17,7 +17,7 @@ from typing import Any
 from . import common
 from .accuracy.limits import tables as limit_tables
 from .accuracy.runout import PUBLISHED, published, slopes
-from .speed import network_steps, roofline, scaling
+from .speed import network_steps, roofline, scaling, thermal
 from .speed import training as speed_of_training
 from .speed.rollouts import row_beside, row_of_peer, row_of_steps
 from .speed.training_scripts import PROJECTS
@@ -507,6 +507,18 @@ def heat_speed(results: list[dict[str, Any]]) -> str:
     return "\n\n".join(parts)
 
 
+def thermal_speed(results: list[dict[str, Any]]) -> str:
+    """Times of steps with heat, laws of temperature, hardening, and time steps that follow the limit."""
+    intro = (
+        "3-D, float32, quadratic kernel, 8 particles per cell, one call of `rollout`; each row beside another of the "
+        "same run (benchmarks/speed/thermal.py)."
+    )
+    parts = [intro]
+    for result in results:
+        parts += [common.describe(result["environment"]) + ":", thermal.table(result)]
+    return "\n\n".join(parts)
+
+
 def accuracy(directory: Path) -> str:
     """One error of each part of the library that has results."""
     parts = {
@@ -594,6 +606,7 @@ def sections(directory: Path) -> dict[str, str]:
         ("datasets_*.json", "Data sets", data_sets),
         ("svd_*_*.json", "Small matrices and sand", small_matrices),
         ("heat_*_*.json", "Speed of the heat solve", heat_speed),
+        ("thermal_*.json", "Speed of steps with heat", thermal_speed),
     ):
         if results := common.read(directory, pattern):
             found[title] = section(results)

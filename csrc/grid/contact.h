@@ -379,13 +379,26 @@ MPM_HD void remember([[maybe_unused]] const ContactArguments<T, D>& a, [[maybe_u
 #endif
 }
 
-// Of a node whose thread looks at it alone: the slot and its touch are found in one loop over the obstacles.
+// Of a node whose thread looks at it alone. Most nodes are away from the walls and outside all obstacles, and need
+// nothing of their slot. Those at walls or beyond need the obstacles near it: they see them from elsewhere.
 template <class T, int D>
 MPM_HD NodeTouch<T, D> lone_touch(const ContactArguments<T, D>& a, int scene, const int (&corner)[D], int local) {
-  NearestSurface<T, D> nearest(a, node_position(a, corner, local));
-  const ContactSlot<T, D> slot = contact_slot(a, scene, corner, nearest);
-  if (!slot.near) return {};
-  return nearest.found(slot.walled);
+  const Vector<T, D> position = node_position(a, corner, local);
+  const bool at_wall = nearest_wall(a, position) <= NearestSurface<T, D>::near_wall(a);
+  uint64_t left = a.obstacles > 0 ? ~uint64_t(0) >> (kMaxObstacles - a.obstacles) : 0;
+  if (at_wall)
+    left = contact_slot(a, scene, corner).near;
+  else if (!acts_in(a, scene))
+    left = 0;
+  if (!left) return {};
+  NearestSurface<T, D> nearest(a, position);
+  const ObstacleRow<T, D>* const row = rows_of_scene(a, scene);
+  MPM_LOOP for (; left; left &= left - 1) {
+    const int k = lowest_bit(left);
+    const ObstaclePose<T, D> pose = obstacle_pose(a, a.kind[k], row[k], scene);
+    if (pose.acts) nearest(k, pose);
+  }
+  return at_wall || nearest.is_inside() ? nearest.found(at_wall || is_walled(a, corner)) : NodeTouch<T, D>{};
 }
 
 template <class T, int D>

@@ -79,6 +79,32 @@ struct NoVisit {
   MPM_HD void operator()(int, const Pose&) const {}
 };
 
+// Whether obstacles have rows and a time in a scene.
+template <class T, int D>
+MPM_HD bool acts_in(const ContactArguments<T, D>& a, int scene) {
+  return (a.rows == 1 || scene < a.rows) && (!a.scene_time || a.times == 1 || scene < a.times);
+}
+
+// Half the way from the first node of a block to the last, along an axis [m].
+template <class T, int D>
+MPM_HD T half_of_block(const ContactArguments<T, D>& a) {
+  return T(0.5 * (kBlockWidth - 1) * a.dx);
+}
+
+template <class T, int D>
+MPM_HD Vector<T, D> middle_of_block(const ContactArguments<T, D>& a, const int (&corner)[D]) {
+  Vector<T, D> middle = node_position(a, corner, 0);
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    middle[i] = middle[i] + half_of_block(a);
+  return middle;
+}
+
+// Whether a wall is near a block.
+template <class T, int D>
+MPM_HD bool is_walled(const ContactArguments<T, D>& a, const int (&corner)[D]) {
+  return nearest_wall(a, middle_of_block(a, corner)) <= half_of_block(a) + T(kReach * a.dx);
+}
+
 // Of an active block of a scene, with the lattice index of its first node. Calls visit(k, pose) for each obstacle that
 // is near: that may touch a node of the block or, beside others, have faces within reach of one. Distances change by no
 // more than the way from a point to another; samples of distances do so between the nodes of their lattice, so that the
@@ -88,16 +114,14 @@ MPM_HD ContactSlot<T, D> contact_slot(const ContactArguments<T, D>& a, int scene
                                       Visit&& visit = {}) {
   ContactSlot<T, D> s;
   s.scene = scene;
-  s.active = (a.rows == 1 || scene < a.rows) && (!a.scene_time || a.times == 1 || scene < a.times);
+  s.active = acts_in(a, scene);
   s.row = rows_of_scene(a, scene);
   MPM_UNROLL for (int i = 0; i < D; i++)
     s.corner[i] = corner[i];
   if (!s.active) return s;
-  const T half = T(0.5 * (kBlockWidth - 1) * a.dx);
-  Vector<T, D> middle = node_position(a, s.corner, 0), sign;
-  MPM_UNROLL for (int i = 0; i < D; i++)
-    middle[i] = middle[i] + half;
-  s.walled = nearest_wall(a, middle) <= half + T(kReach * a.dx);
+  const T half = half_of_block(a);
+  Vector<T, D> middle = middle_of_block(a, s.corner), sign;
+  s.walled = is_walled(a, s.corner);
   if (s.walled) middle = within_walls(a, middle, T(0), sign);
   const T radius = std::sqrt(T(D)) * half * T(1.001) + (s.walled ? T(kSeam * a.dx) : T(0));
   const T margin = a.obstacles > 1 ? T((kReach + kSeam) * a.dx) : T(0);

@@ -1,0 +1,168 @@
+"""Times of steps with heat, laws that read the temperature, hardening sand, and time steps that follow the limit.
+
+    python -m benchmarks.speed.thermal                    # CPU, all cores
+    python -m benchmarks.speed.thermal --device cuda
+    python -m benchmarks.speed.thermal --out DIRECTORY
+
+The cube of `benchmarks/speed/work.py`, 3-D, float32, one call of `torch_mpm.rollout`; each row beside another of the
+same run. Heat has a diffusion number of DIFFUSION. `until a time` is `torch_mpm.rollout_to` beside the same substeps of
+fixed length.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import torch_mpm as mpm
+
+from .. import common, regressions
+from . import rollouts, work
+from .step import Setup, setup
+
+SIDES = {"cpu": (22, 64), "cuda": (22, 46, 100, 200)}
+TIMED_SIDES = {"cpu": (22, 40), "cuda": (40, 80, 200)}
+"""Of `until a time`."""
+BATCHES = {"cpu": ((64, 512),), "cuda": ((256, 2197), (1024, 2197))}
+DIFFUSION = 1e-4
+"""κ dt / (ρ c dx²) of heat."""
+SPECIFIC_HEAT, EXPANSION, LATENT_HEAT = 1000.0, 1e-4, 2e4
+"""[J/(kg K)], [1/K], [J/kg]."""
+SOFTENING = ((0.0, 5.0, 10.0), (1.2e5, 1e5, 4e4))
+"""Temperatures [K] and E [Pa] of a law that softens."""
+NU = 0.25
+
+
+def heated(s: Setup, law: mpm.Material | None = None, melts: bool = False, **options: Any) -> Setup:
+    """A cube with heat, temperatures of 0 to 10 K, and optionally another law."""
+    grid = s.step.grid
+    conductivity = DIFFUSION * work.DENSITY * SPECIFIC_HEAT * grid.dx**2 / work.DT
+    melting = {"melting_point": 5.0, "latent_heat": LATENT_HEAT} if melts else {}
+    heat = mpm.Heat(grid, conductivity, SPECIFIC_HEAT, **melting, **options)
+    step = rollouts.changed(s, heat=heat, law=law or s.step.law)
+    x = s.state.x
+    theta = 5 + 5 * torch.sin(40 * x[:, 0]) * torch.cos(30 * x[:, 1])
+    return Setup(step.prepare(s.state.replace(temperature=theta, F=None, J=None)), step)
+
+
+def softening() -> mpm.Material:
+    return mpm.ThermalExpansion(mpm.NeoHookean(E=mpm.Table(*SOFTENING), nu=NU), EXPANSION)
+
+
+def melting() -> mpm.Material:
+    return mpm.Melting(mpm.NeoHookean(mu=work.MU, lam=work.LAM), mpm.WeaklyCompressible(work.LAM, viscosity=1.0))
+
+
+def wax() -> mpm.Material:
+    solid = mpm.NeoHookean(E=mpm.Table(*SOFTENING), nu=NU)
+    return mpm.ThermalExpansion(mpm.Melting(solid, mpm.WeaklyCompressible(work.LAM, viscosity=1.0)), EXPANSION)
+
+
+def sand(s: Setup, **options: Any) -> Setup:
+    law = mpm.QuarticSand(mu=work.MU, lam=work.LAM, **options)
+    step = rollouts.changed(s, law=law)
+    return Setup(step.prepare(s.state.replace(F=None)), step)
+
+
+ROWS: dict[str, tuple[str | None, Callable[[Setup], Setup]]] = {
+    "neo-Hookean": (None, lambda s: s),
+    "heat": ("neo-Hookean", heated),
+    "heat, E(T) and expansion": ("heat", lambda s: heated(s, softening())),
+    "heat, melting": ("heat", lambda s: heated(s, melting(), melts=True)),
+    "heat, melting, E(T) and expansion": ("heat", lambda s: heated(s, wax(), melts=True)),
+    "heat, von Mises with plastic heating": (
+        "heat",
+        lambda s: heated(s, mpm.VonMises(mu=work.MU, lam=work.LAM, yield_stress=1e3), plastic_heating=0.9),
+    ),
+    "sand": (None, sand),
+    "hardening sand": ("sand", lambda s: sand(s, hardening=(0.6, 0.16, 0.2, 0.17))),
+}
+"""Rows with the row that each stands beside, and cubes made from the neo-Hookean one."""
+
+
+def of_cubes(device: str, sides: tuple[int, ...], samples: int) -> Iterator[dict[str, Any]]:
+    for side in sides:
+        plain, times = setup(work.make(side), device), {}
+        for name, (beside, make) in ROWS.items():
+            row = rollouts.per_step(make(plain), device, samples)
+            times[name] = row["us"]
+            yield {"name": name, **row, **compared(row, beside, times)}
+
+
+def compared(row: dict[str, Any], beside: str | None, times: dict[str, float]) -> dict[str, Any]:
+    return {} if beside is None else {"beside": beside, "times": row["us"] / times[beside]}
+
+
+def until_a_time(s: Setup, device: str, samples: int) -> dict[str, Any]:
+    """Substeps whose length follows the limit, beside substeps of their mean length."""
+    state, scenes = s.state.sorted(s.step.grid), s.step.grid.scenes
+    with torch.no_grad():
+        first = mpm.rollout_to(s.step, state, 64 * float(s.step.stable_dt(state).min()) / 2)
+        end = 10 * float(torch.as_tensor(first.state.time).max())
+        result = mpm.rollout_to(s.step, state, end)
+        substeps = int(result.substeps.max())
+        best = rollouts.least(device, lambda: mpm.rollout_to(s.step, state, end), samples) / substeps
+        fixed = rollouts.least(device, lambda: mpm.rollout(s.step, state, substeps, end / substeps), samples) / substeps
+    name = "until a time" if scenes == 1 else f"until a time, {scenes} scenes"
+    row = {"name": name, "particles": len(state), "steps": substeps, "us": best * 1e6, "rate": len(state) / best}
+    return {**row, "beside": f"fixed dt, {fixed * 1e6:.3g} us", "times": best / fixed}
+
+
+def measure(device: str, quick: bool = False) -> dict[str, Any]:
+    common.use_all_cores()
+    samples = 1 if quick else 5
+    rows = list(of_cubes(device, (6,) if quick else SIDES[device], samples))
+    batches = ((4, 64),) if quick else BATCHES[device]
+    for scenes, particles in batches:
+        times: dict[str, float] = {}
+        plain = rollouts.batched(scenes, particles, device)
+        for name, make in (("neo-Hookean", lambda s: s), ("heat", heated)):
+            row = rollouts.per_step(make(plain), device, samples)
+            times[name] = row["us"]
+            beside = compared(row, None if name == "neo-Hookean" else "neo-Hookean", times)
+            rows.append({"name": f"{name}, {scenes} scenes", **row, **beside})
+    for side in (6,) if quick else TIMED_SIDES[device]:
+        rows.append(until_a_time(setup(work.make(side), device), device, samples))
+    rows += [until_a_time(rollouts.batched(*batch, device), device, samples) for batch in batches]
+    return {"environment": common.environment(device), "rows": rows}
+
+
+def table(result: dict[str, Any]) -> str:
+    header = ("", "particles", "us per substep", "M particles/s", "times", "that of")
+    rows = [
+        (r["name"], r["particles"], r["us"], r["rate"] * 1e-6, r.get("times", 1.0), r.get("beside", ""))
+        for r in result["rows"]
+    ]
+    return common.table(header, rows)
+
+
+def text(result: dict[str, Any]) -> str:
+    title, place = "# Steps with heat, laws of temperature and hardening", common.describe(result["environment"])
+    return "\n".join([title, "", place, "", table(result), ""])
+
+
+def timed(result: dict[str, Any]) -> Iterator[tuple[str, float]]:
+    """Microseconds per substep, for `regressions`."""
+    for r in result["rows"]:
+        yield f"{r['name']}, {r['particles']} particles", r["us"]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
+    parser.add_argument("--quick", action="store_true", help="small sizes, to see that it works")
+    parser.add_argument("--out", type=Path, default=common.RESULTS)
+    arguments = parser.parse_args()
+    result = measure(arguments.device, arguments.quick)
+    print(text(result))
+    name = f"thermal_{common.slug(result['environment']['device'])}"
+    regressions.show(name, result, timed)
+    common.write(arguments.out, name, result, text(result))
+
+
+if __name__ == "__main__":
+    main()
