@@ -133,13 +133,17 @@ struct HeatKernel {
   __device__ int block_of_item(int item) const {
     return entries_below(gridDim.x, [&](int block) { return w.first_item[block + 1] <= item; });
   }
-  // Items and slots are in the order of the block table, and so of scenes.
+  // Items and slots are in the order of the block table, and so of scenes. A search is a chain of loads, which takes
+  // longer than a product of few particles; the ends of the first and of the last scene need none.
   __device__ void lay_out_scene(int scene) const {
     SceneRange& r = w.range[scene];
     const auto item = [&](int s) {
-      return entries_below(*schedule_of(a.topology).item_count, [&](int i) { return scene_of_item(i) < s; });
+      const int count = *schedule_of(a.topology).item_count;
+      if (s == 0 || s == a.topology.scenes) return s == 0 ? 0 : count;
+      return entries_below(count, [&](int i) { return scene_of_item(i) < s; });
     };
     const auto slot = [&](int s) {
+      if (s == 0) return 0;
       return entries_below(a.topology.max_blocks,
                            [&](int i) { return a.topology.block[i] >= 0 && scene_of_slot(i) < s; });
     };
@@ -149,14 +153,15 @@ struct HeatKernel {
     r.slot_end = slot(scene + 1);
     if (scene == a.topology.scenes - 1) *w.used = r.slot_end;
   }
-  // After the above are known.
+  // After the above are known. Blocks before the first and after the last scene have sums of zero.
   __device__ void lay_out_parts(int scene) const {
     SceneRange& r = w.range[scene];
+    const bool last = scene == a.topology.scenes - 1;
     r.item_block = r.slot_block = 0;
     r.item_block_end = r.slot_block_end = 0;
     if (r.item < r.item_end) {
-      r.item_block = block_of_item(r.item);
-      r.item_block_end = block_of_item(r.item_end - 1) + 1;
+      if (scene > 0) r.item_block = block_of_item(r.item);
+      r.item_block_end = last ? int(gridDim.x) : block_of_item(r.item_end - 1) + 1;
     }
     if (r.slot < r.slot_end) {
       r.slot_block = block_of_slot(r.slot);
