@@ -1,5 +1,6 @@
 """Rigid bodies of another simulator: poses and velocities in, wrenches out; a free body integrated here."""
 
+import itertools
 import math
 
 import pytest
@@ -131,6 +132,43 @@ def test_a_ball_comes_to_rest_on_a_block():
     assert float(mean[1]) == pytest.approx(150.0 * 9.8, rel=1e-2)
     assert float(mean[[0, 2]].abs().max()) < 1e-6 * 150.0 * 9.8
     assert 0.5 < float(body.x[1]) < 0.8 and float(body.v.abs().max()) < 0.02
+
+
+def test_the_error_is_of_first_order_in_the_interval():
+    """Differences of intervals of 2, 4, 8 and 16 steps, of a plate that shakes on a block."""
+
+    def end(n: int) -> Tensor:
+        plate = mpm.Box((0.0, 0.0), (0.5, 0.13), "sticky")
+        law = mpm.NeoHookean(E=2e4, nu=0.2)
+        step = mpm.Step(unit_box(2, 0.1), law, boundaries=[plate], walls="sticky")
+        bodies, state = RigidBodies(step, [plate]), block((0.2, 0.0), (0.8, 0.5), 0.1)
+        body = FreeBody(100.0, 2.0, [0.51, 0.52, 0.0, 0.0, -0.01, 0.02])
+        for _ in range(256 // n):
+            state, wrenches = bodies.advance(state, body.row()[None, None], n, 2e-4)
+            body.step(wrenches[0, 0], n * 2e-4)
+        return torch.cat([body.v, body.spin[None]])
+
+    ends = [end(n) for n in (2, 4, 8, 16)]
+    changes = [float((b - a).norm()) for a, b in itertools.pairwise(ends)]
+    for smaller, larger in itertools.pairwise(changes):
+        assert larger / smaller == pytest.approx(2.0, rel=0.1)
+
+
+@pytest.mark.parametrize("mass", [50.0, 200.0])
+def test_the_limit_of_the_mass(mass):
+    """A body that carries material answers each change of its velocity by another one, with the ratio of the masses."""
+    shell = mpm.Box((0.0, 0.0), (0.9, 0.9), "sticky")
+    step = mpm.Step(unit_box(2, 0.1), mpm.NeoHookean(E=1.0, nu=0.2), boundaries=[shell])
+    bodies, state = RigidBodies(step, [shell]), block((0.3, 0.3), (0.7, 0.6), 0.1)
+    body = FreeBody(mass, 1e9, [0.5, 0.5, 0.0, 0.01, 0.0, 0.0])
+    speeds = [0.0]
+    for _ in range(6):
+        speeds.append(float(body.v[0]))
+        state, wrenches = bodies.advance(state, body.row()[None, None], 3, DT)
+        body.step(wrenches[0, 0], 3 * DT)
+    changes = [b - a for a, b in itertools.pairwise(speeds)]
+    for before, after in itertools.pairwise(changes):
+        assert after / before == pytest.approx(-float(state.mass.sum()) / mass, rel=1e-6)
 
 
 # ---- poses

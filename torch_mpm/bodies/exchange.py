@@ -32,6 +32,7 @@ from ..boundaries.motion import rotation_matrix
 from ..boundaries.obstacles import Obstacle
 from ..cuda_graphs.capture import is_readable
 from ..errors import FLOATING, check_count, check_number, check_vector, shape_of
+from ..geometry.values import filled
 from ..geometry.vectors import composed, rotation_vector
 from ..rollouts import rollout
 from ..state.state import State
@@ -122,6 +123,7 @@ class RigidBodies:
                         f"obstacles of body {k} must be boundaries of the step, and those of no other body"
                     )
                 known.remove(id(part.obstacle))
+        self._frames = _frames(self.parts, step.grid.dim)
 
     def __len__(self) -> int:
         return len(self.parts)
@@ -141,10 +143,17 @@ class RigidBodies:
                 and quaternions whose length differs from 1 by more than a thousandth.
         """
         self._check(bodies, state)
-        motion = motion_of(bodies.double(), self.step.grid.dim)
-        for k, parts in enumerate(self.parts):
-            for part in parts:
-                _assign(part, Motion(*(values[:, k] for values in motion)), state.time)
+        dim = self.step.grid.dim
+        owner, position, rotation = (values.to(bodies.device, non_blocking=True) for values in self._frames)
+        motion = Motion(*(values[:, owner] for values in motion_of(bodies.double(), dim)))
+        arm = (rotation_matrix(motion.rotation, dim) @ position[..., None])[..., 0]
+        of_obstacles = Motion(
+            motion.position + arm,
+            _turned(motion.rotation, rotation.expand_as(motion.rotation)),
+            motion.velocity + _swirl(motion.angular_velocity, arm),
+            motion.angular_velocity,
+        )
+        _assign([part.obstacle for parts in self.parts for part in parts], of_obstacles, state.time)
 
     def impulses(self, before: State, after: State, about: Tensor | None = None) -> Tensor:
         """Impulses of the material on the bodies between two states.
@@ -251,34 +260,42 @@ def _parts_of(k: int, body: Obstacle | Part | Sequence[Obstacle | Part]) -> list
     return [part if isinstance(part, Part) else Part(part) for part in given]
 
 
-def _assign(part: Part, body: Motion, time: float | Tensor) -> None:
-    """Place an obstacle of a body with a motion [B, ...] from a time [s], [] or [B]."""
-    obstacle, like = part.obstacle, body.position
-    dim = like.shape[1]
-    centre, velocity, rotation, spin = body.position, body.velocity, body.rotation, body.angular_velocity
-    if part.position is not None:
-        arm = (rotation_matrix(rotation, dim) @ like.new_tensor(part.position)[:, None])[..., 0]
-        centre, velocity = centre + arm, velocity + _swirl(spin, arm)
-    if part.rotation is not None:
-        rotation = _turned(rotation, like.new_tensor(part.rotation).expand_as(rotation))
-    elapsed = torch.as_tensor(time, dtype=like.dtype).to(like.device) - obstacle.start
-    column = elapsed[:, None] if elapsed.dim() else elapsed
-    obstacle.velocity, obstacle.angular_velocity = velocity, spin
+def _frames(parts: Sequence[Sequence[Part]], dim: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Numbers of the bodies of O obstacles [O], and positions [O, D] and rotations [O] or [O, 3] in their frames."""
+    flat = [part for own in parts for part in own]
+    zero = 0.0 if dim == 2 else (0.0,) * 3
+    owner = torch.tensor([k for k, own in enumerate(parts) for _ in own], dtype=torch.int64)
+    position = torch.tensor([part.position or (0.0,) * dim for part in flat], dtype=torch.float64)
+    rotation = torch.tensor([zero if part.rotation is None else part.rotation for part in flat], dtype=torch.float64)
+    return owner, position.reshape(-1, dim), rotation.reshape(-1, *(3,) * (dim - 2))
+
+
+def _assign(obstacles: Sequence[Obstacle], motion: Motion, time: float | Tensor) -> None:
+    """Place O obstacles with a motion [B, O, ...] from a time [s], [] or [B]."""
+    like = motion.position
+    starts = filled([obstacle.start for obstacle in obstacles], like)
+    now = time.to(like) if isinstance(time, Tensor) else filled(time, like)
+    elapsed = now.reshape(-1, 1) - starts
+    column = elapsed[..., None]
     # A pose beside a velocity is that at `start`.
-    turned_back = _turned(-spin * (elapsed if dim == 2 else column), rotation)
-    obstacle.place(centre - velocity * column, turned_back)
+    centre = motion.position - motion.velocity * column
+    spin = motion.angular_velocity
+    rotation = _turned(-spin * (elapsed if spin.dim() == 2 else column), motion.rotation)
+    for k, obstacle in enumerate(obstacles):
+        obstacle.velocity, obstacle.angular_velocity = motion.velocity[:, k], spin[:, k]
+        obstacle.place(centre[:, k], rotation[:, k])
 
 
 def _swirl(spin: Tensor, arm: Tensor) -> Tensor:
-    """Velocities by rotation, of points away from the position [B, D]."""
-    if arm.shape[1] == 3:
+    """Velocities by rotation, of points away from the position [..., D]."""
+    if arm.shape[-1] == 3:
         return torch.linalg.cross(spin, arm)
-    return spin[:, None] * torch.stack([-arm[:, 1], arm[:, 0]], 1)
+    return spin[..., None] * torch.stack([-arm[..., 1], arm[..., 0]], -1)
 
 
 def _turned(turn: Tensor, rotation: Tensor) -> Tensor:
-    """A rotation followed by a turn: angles [B] or rotation vectors [B, 3]."""
-    return turn + rotation if rotation.dim() == 1 else composed(turn, rotation)
+    """A rotation followed by a turn: angles [B, O] or rotation vectors [B, O, 3]."""
+    return turn + rotation if rotation.dim() == 2 else composed(turn, rotation)
 
 
 def _check_rows(wrong: Tensor, sentence: str) -> None:
