@@ -254,6 +254,27 @@ def test_scenes_are_those_of_single_runs(device, per_scene):
         assert (run([0, 1])[1][1] == 0).all()
 
 
+def test_bodies_of_environments(device):
+    """`move` before `advance`, and impulses of it; also in a scene that was reset, whose clock is another one."""
+    ball = mpm.Sphere((0.0, 0.0), 0.15)
+    step = mpm.Step(unit_box(2, 0.1, scenes=2), mpm.NeoHookean(E=2e4, nu=0.2), boundaries=[ball])
+    envs = mpm.Environments(step, [block((0.2, 0.2), (0.8, 0.6), 0.1, device=device)] * 2)
+    envs.count_impulses()
+    bodies = RigidBodies(step, [ball])
+    row = torch.tensor([[[0.5, 0.62, 0.0, 0.5, -1.0, 2.0]]] * 2, dtype=F64, device=device)
+    found = []
+    for _ in range(2):
+        bodies.move(row, envs.state)
+        before = envs.state
+        envs.advance(N, DT)
+        found.append(bodies.impulses(before, envs.state, row))
+        envs.reset([1])
+    assert float(found[0][0].abs().max()) > 0.01
+    torch.testing.assert_close(found[0][1], found[0][0], rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(found[1][1], found[0][1], rtol=1e-10, atol=1e-10)
+    assert not torch.allclose(found[1][0], found[0][0])
+
+
 def test_gradients_of_wrenches():
     parts = dumbbell(2, "separate")
     step = mpm.Step(unit_box(2, 0.1), mpm.NeoHookean(E=2e4, nu=0.2), boundaries=[p.obstacle for p in parts])

@@ -1,6 +1,7 @@
 """Bodies of a MuJoCo model in the material: their shapes, momentum, weights, light bodies, batches, errors."""
 
 import math
+import sys
 
 import numpy as np
 import pytest
@@ -208,6 +209,7 @@ def test_planes_and_errors_of_geoms():
             r"bodies must be names of bodies of the model, \['body', 'world'\], got 'hand'",
         ),
         ({"bodies": [1]}, ValueError, "got 1"),
+        ({"bodies": ["body", "body"]}, ValueError, r"bodies must be different, got \['body', 'body'\]"),
         ({"bodies": "body"}, TypeError, "bodies must be a list of names, got str"),
         ({"bodies": ["world"]}, ValueError, "bodies must have a colliding geom each, got 'world' without one"),
         ({"geoms": ["palm"]}, ValueError, r"geoms must be colliding geoms of the bodies, \['geom'\], got 'palm'"),
@@ -276,3 +278,9 @@ def test_unstable_simulations_are_errors(tmp_path, monkeypatch):
     chooses = mpm.couple(free_body(), elastic(), ["body"])
     with pytest.raises(mpm.SimulationError, match=r"needs time steps of .* s, and MuJoCo takes 0\.002 s"):
         chooses.advance(state.replace(v=1e9 * torch.ones_like(state.v)))
+
+
+def test_the_package_may_be_missing(monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(ImportError, match=r"coupling with MuJoCo: the package mujoco .*torch-mpm\[mujoco\]"):
+        mpm.couple(None, elastic(), ["body"])

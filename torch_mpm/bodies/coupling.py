@@ -106,6 +106,8 @@ class MujocoCoupling:
         for name, names in (("bodies", bodies), ("geoms", geoms)):
             if names is not None and (isinstance(names, str) or not isinstance(names, Sequence)):
                 raise TypeError(f"{name} must be a list of names, got {shape_of(names)}")
+        if len(set(bodies)) < len(bodies):
+            raise ValueError(f"bodies must be different, got {list(bodies)}")
         self.substeps = None if substeps is None else check_count("substeps", substeps, 1)
         self.exchanges = check_count("exchanges", exchanges, 1)
         self.model, self.step = model, step
@@ -284,7 +286,7 @@ def _data_of(mujoco: Any, model: Any, data: Any, scenes: int) -> list[Any]:
     for one in given:
         if not isinstance(one, mujoco.MjData):
             raise TypeError(f"data must be a mujoco.MjData or a list of them, got {shape_of(one)}")
-        if one.signature != model.signature:
+        if one.model is not model:
             raise ValueError("data must be of the model, got MjData of another one")
     if len(given) != scenes or len(set(map(id, given))) != scenes:
         raise ValueError(f"data must be one MjData for each of {scenes} scenes, got {len(set(map(id, given)))}")
