@@ -222,6 +222,10 @@ def test_velocities_of_a_change():
     torch.testing.assert_close(flat[0, 0], torch.tensor([0.0, 0.0, 3.0, 10.0, 0.0, 10 * (2 * math.pi - 6.0)]))
     with pytest.raises(ValueError, match="seconds must be positive"):
         with_velocities(*poses, 0.0)
+    with pytest.raises(ValueError, match=r"poses must have shape .*, got \[1, 1, 5\]"):
+        with_velocities(poses[0][..., :5], poses[1], 0.1)
+    with pytest.raises(ValueError, match=r"later must have the dimension of poses, 3, got \[1, 1, 3\]"):
+        with_velocities(poses[0], poses[1][..., :3], 0.1)
 
 
 # ---- batches and gradients
@@ -337,3 +341,6 @@ def test_errors():
             RigidBodies(step, [ball]).advance(state, rows, n, dt)
     with pytest.raises(ValueError, match=r"state\.impulse is None"):
         RigidBodies(step, [ball]).impulses(state, state)
+    counted = step.with_impulses(state)
+    with pytest.raises(ValueError, match=r"about must have shape \[B, K, D\] = \[1, 1, 2\], got \[1, 2\]"):
+        RigidBodies(step, [ball]).impulses(counted, counted, rows[0, :, :2])

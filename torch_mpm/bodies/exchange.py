@@ -166,10 +166,12 @@ class RigidBodies:
             [B, K, 6] (3-D) or [B, K, 3] (2-D), float64: linear [N s] and angular [N m s].
 
         Raises:
-            ValueError: for states that count no impulses.
+            ValueError: for states that count no impulses, or points of another shape.
         """
         on = self.step.impulses(after) - self.step.impulses(before)
-        rows, dim = [], self.step.grid.dim
+        rows, dim, scenes = [], self.step.grid.dim, self.step.grid.scenes
+        if about is not None and (about.dim() != 3 or about.shape[:2] != (scenes, len(self)) or about.shape[2] < dim):
+            raise ValueError(f"about must have shape [B, K, D] = {[scenes, len(self), dim]}, got {shape_of(about)}")
         for k, parts in enumerate(self.parts):
             point = about[:, k, :dim].double() if about is not None else None
             parts_on = [on[part.obstacle] for part in parts]
@@ -240,9 +242,18 @@ def with_velocities(poses: Tensor, later: Tensor, seconds: float) -> Tensor:
 
     Returns:
         [B, K, 13] (3-D) or [B, K, 6] (2-D); rotations by the smallest angle.
+
+    Raises:
+        TypeError, ValueError: for another time or shape.
     """
     check_number("seconds", seconds, "positive and finite", lambda v: 0 < v < math.inf)
-    dim = 3 if poses.shape[-1] in (POSE[3], POSE[3] + VELOCITY[3]) else 2
+    columns = {POSE[dim] + more: dim for dim in POSE for more in (0, VELOCITY[dim])}
+    for name, given in (("poses", poses), ("later", later)):
+        if not isinstance(given, Tensor) or given.dim() != 3 or given.shape[2] not in columns:
+            raise ValueError(f"{name} must have shape [B, K, 7] or [B, K, 13], or 3 or 6 in 2-D, got {shape_of(given)}")
+    dim = columns[poses.shape[2]]
+    if columns[later.shape[2]] != dim:
+        raise ValueError(f"later must have the dimension of poses, {dim}, got {shape_of(later)}")
     pose = poses[..., : POSE[dim]]
     if dim == 2:
         change = later[..., :3] - pose
