@@ -95,6 +95,22 @@ def test_light_bodies_need_exchanges(tilt):
     assert most < 0.6 and lost < 1e-12
 
 
+@pytest.mark.parametrize("exchanges", [1, 4])
+def test_the_error_is_of_first_order_in_the_time_step(exchanges):
+    """Of a plate that shakes on a block, with equal substeps."""
+
+    def end(n: int) -> np.ndarray:
+        model = free_body(n * 5e-4, at="0.51 0.5 0.52", type="box", size="0.25 0.25 0.065", mass=100.0)
+        options = {"kind": "sticky", "substeps": n, "exchanges": exchanges}
+        coupling = mpm.couple(model, elastic(walls="sticky"), ["body"], **options)
+        coupling.data[0].qvel[:] = [0.0, 0.0, -0.01, 0.02, 0.0, 0.0]
+        coupling.advance(block((0.2, 0.2, 0.0), (0.8, 0.8, 0.5), 0.1), 32 // n)
+        return coupling.data[0].qvel.copy()
+
+    first, second, third = end(1), end(2), end(4)
+    assert np.linalg.norm(third - second) / np.linalg.norm(second - first) == pytest.approx(2.0, rel=0.15)
+
+
 def test_scenes_are_those_of_single_runs():
     """Each with data of its own; one is reset and runs again."""
     model = free_body(at="0.5 0.5 0.55")
