@@ -11,8 +11,10 @@ DOCS = Path(__file__).parent.parent / "docs"
 
 
 @pytest.mark.filterwarnings("ignore:Anomaly Detection")
-@pytest.mark.parametrize("name", ["training.md", "recipes.md", "splats.md"])
+@pytest.mark.parametrize("name", ["training.md", "recipes.md", "splats.md", "bodies.md"])
 def test_programs_of_a_document(name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    if name == "bodies.md":
+        pytest.importorskip("mujoco")
     text = (DOCS / name).read_text()
     module = types.ModuleType("document")  # which compilers look for
     monkeypatch.setitem(sys.modules, "document", module)

@@ -4,7 +4,20 @@ import math
 
 import pytest
 import torch
-from cases.impulses import DT, F64, GRAVITY, LAWS, STEPS, WALLS, cloud, obstacles, one_by_one
+from cases.impulses import (
+    DT,
+    F64,
+    GRAVITY,
+    LAWS,
+    STEPS,
+    WALLS,
+    by_scene,
+    cloud,
+    cross,
+    momentum,
+    obstacles,
+    one_by_one,
+)
 from helpers import TOLERANCE, random_blocks, random_nodes, relative_error
 from oracle import impulses as reference
 from torch import Tensor
@@ -16,28 +29,8 @@ from torch_mpm import ops
 TRANSFERS = {"apic": {}, "pic": {"transfer": "pic"}, "flip": {"transfer": "flip"}, "blend": {"flip": 0.7}}
 
 
-def cross(a: Tensor, b: Tensor) -> Tensor:
-    if a.shape[-1] == 3:
-        return torch.linalg.cross(a, b.expand_as(a))
-    return (a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])[..., None]
-
-
 def few_blocks(dim: int, device: str, scenes: int) -> mpm.Blocks:
     return random_blocks(mpm.Grid(0.1, (0.0,) * dim, (0.6, 0.5, 0.5)[:dim], scenes=scenes), device)
-
-
-def by_scene(values: Tensor, state: mpm.State, scenes: int) -> Tensor:
-    scene = torch.zeros(len(state), dtype=torch.int64) if state.scene is None else state.scene.long().cpu()
-    return torch.zeros(scenes, values.shape[1], dtype=F64).index_add(0, scene, values.detach().cpu().double())
-
-
-def momentum(state: mpm.State, grid: mpm.Grid) -> tuple[Tensor, Tensor]:
-    """Linear and angular [B, ...], with that of the affine field (Jiang et al. 2015)."""
-    m, x, v = state.mass[:, None], state.x, state.v
-    C = torch.zeros(*x.shape, x.shape[1]).to(x) if state.C is None else state.C
-    planes = [(0, 1)] if x.shape[1] == 2 else [(1, 2), (2, 0), (0, 1)]
-    spin = torch.stack([C[:, j, i] - C[:, i, j] for i, j in planes], 1) / grid.inverse_inertia
-    return by_scene(m * v, state, grid.scenes), by_scene(m * (cross(x, v) + spin), state, grid.scenes)
 
 
 def gains(step: mpm.Step, state: mpm.State, n: int) -> tuple[Tensor, Tensor]:

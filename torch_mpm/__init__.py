@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 from . import _interrupted_start as _interrupted_start  # First, as the imports below take a second or more.
 from . import _library as _library
 from . import _moved, laws, ops, splats
+from .bodies import RigidBodies, couple
 from .boundaries import SDF, Box, Capsule, Obstacle, Plane, Revolved, Sphere, Walls, Waypoints
 from .data.trajectory import Trajectory
 from .errors import (
@@ -80,6 +81,7 @@ __all__ = [
     "Plane",
     "PrecisionWarning",
     "Revolved",
+    "RigidBodies",
     "RolloutEstimate",
     "RolloutPlan",
     "RolloutToResult",
@@ -94,6 +96,7 @@ __all__ = [
     "Waypoints",
     "advance",
     "captured",
+    "couple",
     "estimate_rollout",
     "frames",
     "g2p",

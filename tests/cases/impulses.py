@@ -1,4 +1,4 @@
-"""Scenes of obstacles and walls that take impulses."""
+"""Scenes of obstacles and walls that take impulses, and the momentum of particles."""
 
 import torch
 from torch import Tensor
@@ -46,3 +46,23 @@ def one_by_one(step: mpm.Step, state: mpm.State, n: int = STEPS, dt: float | Ten
     for _ in range(n):
         state = step(state, dt)
     return state
+
+
+def cross(a: Tensor, b: Tensor) -> Tensor:
+    if a.shape[-1] == 3:
+        return torch.linalg.cross(a, b.expand_as(a))
+    return (a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])[..., None]
+
+
+def by_scene(values: Tensor, state: mpm.State, scenes: int) -> Tensor:
+    scene = torch.zeros(len(state), dtype=torch.int64) if state.scene is None else state.scene.long().cpu()
+    return torch.zeros(scenes, values.shape[1], dtype=F64).index_add(0, scene, values.detach().cpu().double())
+
+
+def momentum(state: mpm.State, grid: mpm.Grid) -> tuple[Tensor, Tensor]:
+    """Linear and angular [B, ...], with that of the affine field (Jiang et al. 2015)."""
+    m, x, v = state.mass[:, None], state.x, state.v
+    C = torch.zeros(*x.shape, x.shape[1]).to(x) if state.C is None else state.C
+    planes = [(0, 1)] if x.shape[1] == 2 else [(1, 2), (2, 0), (0, 1)]
+    spin = torch.stack([C[:, j, i] - C[:, i, j] for i, j in planes], 1) / grid.inverse_inertia
+    return by_scene(m * v, state, grid.scenes), by_scene(m * (cross(x, v) + spin), state, grid.scenes)

@@ -26,6 +26,15 @@ def composed(a: Tensor, b: Tensor) -> Tensor:
     (p, u), (q, v) = _quaternion(a), _quaternion(b)
     scalar = p * q - (u * v).sum(-1, keepdim=True)
     vector = p * v + q * u + torch.linalg.cross(*torch.broadcast_tensors(u, v))
+    return rotation_vector(scalar, vector)
+
+
+def rotation_vector(scalar: Tensor, vector: Tensor) -> Tensor:
+    """Rotation vector [..., 3] [rad], with an angle of at most π, of quaternions of unit length, their scalar [..., 1]
+    and vector [..., 3].
+
+    Twice differentiable where the angle is below π.
+    """
     scalar, vector = scalar.abs(), torch.where(scalar < 0, -vector, vector)
     half = norm(vector)[..., None]
     small = half < 1e-9  # Here atan2(half, scalar)/half is 1 to rounding, as scalar is.
