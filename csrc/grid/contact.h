@@ -96,6 +96,14 @@ class NearestSurface {
     return touch_;
   }
 
+  // Of a node at a wall or beyond, seen from the point of the wall. Samples of distances have slopes up to √D.
+  MPM_HD NodeTouch<T, D> at_wall() const {
+    NodeTouch<T, D> touch;
+    const T way = T(1.001 * D) * SolidAt<T, D>::seam_of(a_);
+    if (nearest_ <= a_.rounding + way) touch.obstacle = NodeTouch<T, D>::several;
+    return touch;
+  }
+
   // How near a node at a wall is to it.
   MPM_HD static T near_wall(const ContactArguments<T, D>& a) { return a.rounding + T(1e-6 * a.dx); }
 
@@ -379,26 +387,22 @@ MPM_HD void remember([[maybe_unused]] const ContactArguments<T, D>& a, [[maybe_u
 #endif
 }
 
-// Of a node whose thread looks at it alone. Most nodes are away from the walls and outside all obstacles, and need
-// nothing of their slot. Those at walls or beyond need the obstacles near it: they see them from elsewhere.
+// Of a node whose thread looks at it alone. A node at a wall or beyond sees the obstacles from the point of the wall,
+// or from beside that (`find_surfaces`), where distances differ by no more than the way.
 template <class T, int D>
 MPM_HD NodeTouch<T, D> lone_touch(const ContactArguments<T, D>& a, int scene, const int (&corner)[D], int local) {
-  const Vector<T, D> position = node_position(a, corner, local);
+  if (!acts_in(a, scene)) return {};
+  Vector<T, D> position = node_position(a, corner, local), sign;
   const bool at_wall = nearest_wall(a, position) <= NearestSurface<T, D>::near_wall(a);
-  uint64_t left = a.obstacles > 0 ? ~uint64_t(0) >> (kMaxObstacles - a.obstacles) : 0;
-  if (at_wall)
-    left = contact_slot(a, scene, corner).near;
-  else if (!acts_in(a, scene))
-    left = 0;
-  if (!left) return {};
+  if (at_wall) position = within_walls(a, position, T(0), sign);
   NearestSurface<T, D> nearest(a, position);
   const ObstacleRow<T, D>* const row = rows_of_scene(a, scene);
-  MPM_LOOP for (; left; left &= left - 1) {
-    const int k = lowest_bit(left);
+  MPM_LOOP for (int k = 0; k < a.obstacles; k++) {
     const ObstaclePose<T, D> pose = obstacle_pose(a, a.kind[k], row[k], scene);
     if (pose.acts) nearest(k, pose);
   }
-  return at_wall || nearest.is_inside() ? nearest.found(at_wall || is_walled(a, corner)) : NodeTouch<T, D>{};
+  if (at_wall) return nearest.at_wall();
+  return nearest.is_inside() ? nearest.found(is_walled(a, corner)) : NodeTouch<T, D>{};
 }
 
 template <class T, int D>
@@ -417,19 +421,43 @@ MPM_HD_CALL void apply_several(bool wanted, const ContactArguments<T, D>& a, int
   if (wanted) v = met.after(v);
 }
 
-// Replaces the velocity of a node that meets several surfaces by that after contact, and returns whether it does. By
-// all threads of a warp, as `any_of_warp`. Kernels call it in a pass of its own, after that over all nodes, where few
-// values are live: nvcc keeps values that are live across a deep call in memory.
+// The nodes of a thread that meet several surfaces, by their number in the order in which the thread looks at nodes.
+// Numbers from `most` on share a bit.
+struct SeveralNodes {
+  static constexpr int most = 63;
+  uint64_t bits = 0;
+
+  MPM_HD bool any() const { return bits != 0; }
+  MPM_HD bool may_have(int number) const { return bits >> (number < most ? number : most) & 1; }
+  MPM_HD void add(int number) { bits |= uint64_t(1) << (number < most ? number : most); }
+};
+
+// Replaces the velocity of the node `number` of a thread, if it is one of `nodes`, by that after contact, and returns
+// whether it is. By all threads of a warp, as `any_of_warp`. Kernels call it in a pass of its own, after that over all
+// nodes, where few values are live: nvcc keeps values that are live across a deep call in memory.
 template <class T, int D>
-MPM_HD bool meet_several(bool wanted, const ContactArguments<T, D>& a, int scene, const int (&corner)[D], int local,
-                         Vector<T, D>& v) {
-  bool several = wanted;
-  if (several) several = lone_touch(a, scene, corner, local).obstacle == NodeTouch<T, D>::several;
+MPM_HD bool meet_several(const SeveralNodes& nodes, int number, bool has_mass, const ContactArguments<T, D>& a,
+                         int scene, const int (&corner)[D], int local, Vector<T, D>& v) {
+  bool several = has_mass && nodes.may_have(number);
+  if (several && number >= nodes.most)
+    several = lone_touch(a, scene, corner, local).obstacle == NodeTouch<T, D>::several;
   if (any_of_warp(several)) {
     apply_several(several, a, scene, corner, local, v);
     join_warp();
   }
   return several;
+}
+
+// The velocity v of a node after contact, if that needs no search for surfaces; `searches` is set if it does.
+template <class T, int D>
+MPM_HD Vector<T, D> after_known_contact(const ContactArguments<T, D>& a, const NodeTouch<T, D>& touch, int scene,
+                                        const int (&corner)[D], int local, const Vector<T, D>& v, bool& searches) {
+  if (touch.obstacle >= 0) return touch.after(v);
+  if (touch.obstacle != touch.several) return v;
+  MetSurfaces<T, D> met;
+  if (recall(a, key_of_node(a, scene, corner, local), met)) return met.after(v);
+  searches = true;
+  return v;
 }
 
 // ---- passes over the nodes of a slot

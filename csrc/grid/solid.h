@@ -247,7 +247,7 @@ struct Foot {
 // A depth in steps of 1e-4 cells, so that rounding does not distinguish equal depths.
 template <class T, int D>
 MPM_HD T rounded_depth(const ContactArguments<T, D>& a, const T& depth) {
-  return std::floor(depth * T(1e4 / a.dx) + T(0.5));
+  return std::floor(depth * (T(1e4) * a.geometry.inverse_dx) + T(0.5));
 }
 
 template <class T, int D>

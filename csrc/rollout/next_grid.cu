@@ -85,18 +85,18 @@ struct SlotsInStrides {
 // Contact of the nodes of a thread that meet several surfaces, from their stored velocities before that. By all threads
 // of a warp.
 template <class T, int D>
-__device__ __noinline__ void add_contact(const NextGridArguments<T, D>& a) {
+__device__ __noinline__ void add_contact(const NextGridArguments<T, D>& a, const SeveralNodes& several) {
   const SlotsInStrides slots(a);
   const int local = int(threadIdx.x) % kBlockNodes<D>;
   int slot = slots.first<D>();
-  while (any_of_warp(slot < slots.all)) {
+  for (int turn = 0; any_of_warp(slot < slots.all); turn++) {
     NodeRow<T, D>* const stored = a.update.updated + (int64_t(slot) * kBlockNodes<D> + local);
     SlotUpdate<T, D> there;
     NodeRow<T, D> row{T(0), zero_vector<T, D>()};
     bool used = slot < slots.all;
     if (used) there = slot_update(a.update, slot), used = there.active;
-    if (used) row = *stored;
-    if (meet_several(row.mass != T(0), a.contact, there.scene, there.corner, local, row.value))
+    if (used && several.may_have(turn)) row = *stored;
+    if (meet_several(several, turn, row.mass != T(0), a.contact, there.scene, there.corner, local, row.value))
       watch(a, there, row), *stored = row;
     if (slot < slots.all) slot = slots.after(slot, used);
   }
@@ -121,16 +121,16 @@ __global__ void __launch_bounds__(kThreads, sizeof(T) == 4 ? 2 : 1)
     *a.next_displacement = a.displacement->next(a.particles);
     if (a.items_taken) *a.items_taken = 0;
   }
-  bool several = false;
-  for (int slot = first; slot < slots.all; slot = slots.after(slot, node.is_in_use())) {
+  SeveralNodes several;
+  for (int slot = first, turn = 0; slot < slots.all; slot = slots.after(slot, node.is_in_use()), turn++) {
     if (slot != found) {
       node.find(a, slot);
       if (Obstacles && node.is_in_use() && node.sums(a).mass != T(0)) node.find_obstacles(a);
     }
-    if (node.is_in_use()) several = take_node<Obstacles>(a, node) || several;
+    if (node.is_in_use() && take_node<Obstacles>(a, node)) several.add(turn);
   }
   if constexpr (Obstacles)
-    if (any_of_warp(several)) add_contact(a);
+    if (any_of_warp(several.any())) add_contact(a, several);
 }
 
 }  // namespace

@@ -455,7 +455,9 @@ def test_one_particle_reads_its_temperature(device):
 
 @pytest.mark.parametrize("change", ["in place", "through data", "assigned"])
 def test_tables_that_change_between_calls(change, device):
-    """Their contents are compared; so is what a law has beside them."""
+    """Their contents are compared, on CUDA their versions; so is what a law has beside them."""
+    if change == "through data" and device != "cpu":
+        pytest.skip("changes through .data are not seen on CUDA (docs/concepts.md)")
     step, state = thermal(["softening"], 2, device=device)
     step.law.E = Table(SOFTENING.temperature, SOFTENING.value.clone()).to(device)
     first = compare(step, state).v

@@ -61,14 +61,14 @@ struct SceneState {
 // Contact of the nodes of a scene that meet several surfaces, from their velocities before it. Called by all threads.
 template <class T, int D>
 __device__ __noinline__ void add_contact(const GridUpdateArguments<T, D>& update, const ContactArguments<T, D>& contact,
-                                         NodeRow<T, D>* rows, int nodes) {
-  for (int i = threadIdx.x; any_of_warp(i < nodes); i += blockDim.x) {
+                                         const SeveralNodes& several, NodeRow<T, D>* rows, int nodes) {
+  for (int i = threadIdx.x, turn = 0; any_of_warp(i < nodes); i += blockDim.x, turn++) {
     const int local = i % kBlockNodes<D>;
     SlotUpdate<T, D> there;
     NodeRow<T, D> row{T(0), zero_vector<T, D>()};
-    const bool has_mass = i < nodes && rows[i].mass != T(0);
+    const bool has_mass = i < nodes && several.may_have(turn) && rows[i].mass != T(0);
     if (has_mass) row = rows[i], there = slot_update(update, i / kBlockNodes<D>);
-    if (meet_several(has_mass, contact, there.scene, there.corner, local, row.value)) rows[i] = row;
+    if (meet_several(several, turn, has_mass, contact, there.scene, there.corner, local, row.value)) rows[i] = row;
   }
 }
 
@@ -467,12 +467,12 @@ class SceneStep {
       walk_columns();
   }
 
-  // Returns, to all threads, whether a node meets several surfaces; it has its velocity before contact then.
+  // Returns, to all threads, whether a node meets several surfaces; it has its velocity before contact then, and is
+  // added to those of its thread.
   template <bool Obstacles>
-  __device__ bool update_nodes() const {
-    bool several = false;
+  __device__ bool update_nodes(SeveralNodes& several) const {
 #pragma unroll 1
-    for (int i = threadIdx.x; i < state.blocks * count; i += blockDim.x) {
+    for (int i = threadIdx.x, turn = 0; i < state.blocks * count; i += blockDim.x, turn++) {
       const int slot = i / count, local = i % count;
       NodeRow<T, D>& node = reinterpret_cast<NodeRow<T, D>*>(blocks.node)[i];
       blocks.head[i] = Rows::end;
@@ -484,12 +484,12 @@ class SceneStep {
       NodeRow<T, D> row = update_node(update, there, local, node);
       if constexpr (Obstacles) {
         const NodeTouch<T, D> touch = lone_touch(contact, there.scene, there.corner, local);
-        several = several || touch.obstacle == touch.several;
+        if (touch.obstacle == touch.several) several.add(turn);
         if (touch.obstacle >= 0) row.value = touch.after(row.value);
       }
       node = row;
     }
-    if constexpr (Obstacles) return __syncthreads_or(several);
+    if constexpr (Obstacles) return __syncthreads_or(several.any());
     __syncthreads();
     return false;
   }
@@ -578,8 +578,10 @@ __device__ __forceinline__ int64_t run_scene(Step& s, int64_t step) {
     s.list_columns();
     s.walk();
     auto loaded = s.load_first();
-    if (s.template update_nodes<Obstacles>()) {
-      add_contact(s.update, s.contact, reinterpret_cast<NodeRow<T, D>*>(s.blocks.node), s.state.blocks * Step::count);
+    SeveralNodes several;
+    if (s.template update_nodes<Obstacles>(several)) {
+      add_contact(s.update, s.contact, several, reinterpret_cast<NodeRow<T, D>*>(s.blocks.node),
+                  s.state.blocks * Step::count);
       __syncthreads();
       loaded = s.load_first();
     }

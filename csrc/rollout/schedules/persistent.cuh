@@ -119,21 +119,24 @@ struct TileNodes {
   }
 };
 
-// The velocity of nodes after the grid update and contact with one surface, computed where it is read.
+// The velocity of nodes after the grid update and contact, computed where it is read.
 template <Contacts C, class T, int D>
 struct NodeVelocities {
   const GridUpdateArguments<T, D>& update;
   const ContactArguments<T, D>& contact;
   NodeRows<T, D> nodes;
 
-  // Of a node that meets several surfaces, that before contact; `several` is set.
+  // Of a node that meets several surfaces, that before contact; `several` is set. The kernel of one surface has the
+  // contact of those whose surfaces are known.
   __device__ Vector<T, D> at(const SlotUpdate<T, D>& there, const TileNode& place, bool& several) const {
     const NodeRow<T, D> node = row(place);
     if (node.mass == T(0)) return zero_vector<T, D>();
     const Vector<T, D> v = update_node(update, there, place.local, node).value;
     if constexpr (C == Contacts::none) return v;
     const NodeTouch<T, D> touch = lone_touch(contact, there.scene, there.corner, place.local);
-    several = several || touch.obstacle == touch.several;
+    if constexpr (C == Contacts::one_surface)
+      return after_known_contact(contact, touch, there.scene, there.corner, place.local, v, several);
+    several = touch.obstacle == touch.several;
     return touch.obstacle >= 0 ? touch.after(v) : v;
   }
   __device__ NodeRow<T, D> row(const TileNode& place) const {
@@ -145,10 +148,10 @@ struct NodeVelocities {
 template <class S, class T, int D>
 __device__ __noinline__ void add_contact(const TileNodes<S>& nodes,
                                          const NodeVelocities<Contacts::several_surfaces, T, D>& velocities,
-                                         NodeValue<T, D>* tile) {
-  for (int i = threadIdx.x; any_of_warp(i < nodes.count()); i += S::threads) {
+                                         const SeveralNodes& several, NodeValue<T, D>* tile) {
+  for (int i = threadIdx.x, turn = 0; any_of_warp(i < nodes.count()); i += S::threads, turn++) {
     TileNode node{-1};
-    if (i < nodes.count()) node = nodes.at(i);
+    if (i < nodes.count() && several.may_have(turn)) node = nodes.at(i);
     SlotUpdate<T, D> there;
     Vector<T, D> v = zero_vector<T, D>();
     const bool has_mass = node.slot >= 0 && velocities.row(node).mass != T(0);
@@ -157,7 +160,7 @@ __device__ __noinline__ void add_contact(const TileNodes<S>& nodes,
 #pragma unroll
       for (int axis = 0; axis < D; axis++) v[axis] = tile[node.place].e[axis];
     }
-    if (meet_several(has_mass, velocities.contact, there.scene, there.corner, node.local, v))
+    if (meet_several(several, turn, has_mass, velocities.contact, there.scene, there.corner, node.local, v))
       store(v, tile[node.place]);
   }
 }
@@ -300,18 +303,20 @@ class ItemStep {
   __device__ bool load_velocities(const NodeVelocities<C, T, D>& velocities, NodeValue<T, D>* tile,
                                   int first_out_of_block, int of_tile, int count) const {
     const TileNodes<S> nodes{m, schedule_of(topology()).neighbours, first_out_of_block, of_tile, count};
-    bool several = false;
+    SeveralNodes several;
 #pragma unroll 1
-    for (int i = threadIdx.x; i < nodes.count(); i += threads) {
+    for (int i = threadIdx.x, turn = 0; i < nodes.count(); i += threads, turn++) {
       const TileNode node = nodes.at(i);
       if (node.place < 0) continue;
       Vector<T, D> v = zero_vector<T, D>();
-      if (node.slot >= 0) v = velocities.at(nodes.update_of(node, update), node, several);
+      bool meets_several = false;
+      if (node.slot >= 0) v = velocities.at(nodes.update_of(node, update), node, meets_several);
+      if (meets_several) several.add(turn);
       store(v, tile[node.place]);
     }
-    if constexpr (C == Contacts::one_surface) return !__syncthreads_or(several);
+    if constexpr (C == Contacts::one_surface) return !__syncthreads_or(several.any());
     if constexpr (C == Contacts::several_surfaces)
-      if (__syncthreads_or(several)) add_contact(nodes, velocities, tile);
+      if (__syncthreads_or(several.any())) add_contact(nodes, velocities, several, tile);
     __syncthreads();
     return true;
   }
