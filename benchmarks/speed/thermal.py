@@ -30,6 +30,8 @@ TIMED_SIDES = {"cpu": (22, 40), "cuda": (40, 80, 200)}
 BATCHES = {"cpu": ((64, 512),), "cuda": ((256, 2197), (1024, 2197))}
 DIFFUSION = 1e-4
 """κ dt / (ρ c dx²) of heat."""
+MOST_SUBSTEPS = 4096
+"""Of a call `until a time`."""
 SPECIFIC_HEAT, EXPANSION, LATENT_HEAT = 1000.0, 1e-4, 2e4
 """[J/(kg K)], [1/K], [J/kg]."""
 SOFTENING = ((0.0, 5.0, 10.0), (1.2e5, 1e5, 4e4))
@@ -101,8 +103,9 @@ def until_a_time(s: Setup, device: str, samples: int) -> dict[str, Any]:
     """Substeps whose length follows the limit, beside substeps of their mean length."""
     state, scenes = s.state.sorted(s.step.grid), s.step.grid.scenes
     with torch.no_grad():
-        first = mpm.rollout_to(s.step, state, 64 * float(s.step.stable_dt(state).min()) / 2)
-        end = 10 * float(torch.as_tensor(first.state.time).max())
+        dt = float(s.step.stable_dt(state).min()) / 2
+        spent = rollouts.least(device, lambda: mpm.rollout(s.step, state, 64, dt), 2) / 64
+        end = dt * max(64, min(MOST_SUBSTEPS, int(rollouts.SECONDS / spent)))
         result = mpm.rollout_to(s.step, state, end)
         substeps = int(result.substeps.max())
         best = rollouts.least(device, lambda: mpm.rollout_to(s.step, state, end), samples) / substeps

@@ -127,13 +127,15 @@ struct NodeVelocities {
   NodeRows<T, D> nodes;
 
   // Of a node that meets several surfaces, that before contact; `several` is set. The kernel of one surface has the
-  // contact of those whose surfaces are known.
-  __device__ Vector<T, D> at(const SlotUpdate<T, D>& there, const TileNode& place, bool& several) const {
+  // contact of those whose surfaces are known. `find_touch()` returns the touch of the node.
+  template <class FindTouch>
+  __device__ Vector<T, D> at(const SlotUpdate<T, D>& there, const TileNode& place, const FindTouch& find_touch,
+                             bool& several) const {
     const NodeRow<T, D> node = row(place);
     if (node.mass == T(0)) return zero_vector<T, D>();
     const Vector<T, D> v = update_node(update, there, place.local, node).value;
     if constexpr (C == Contacts::none) return v;
-    const NodeTouch<T, D> touch = lone_touch(contact, there.scene, there.corner, place.local);
+    const NodeTouch<T, D> touch = find_touch();
     if constexpr (C == Contacts::one_surface)
       return after_known_contact(contact, touch, there.scene, there.corner, place.local, v, several);
     several = touch.obstacle == touch.several;
@@ -209,6 +211,9 @@ class ItemStep {
 #pragma unroll
     for (int o = 0; o < 1 << D; o++) active_ |= unsigned(m.slots[o] >= 0) << o;
   }
+
+  // Whether the obstacles of the item stay where they are.
+  __device__ void set_rest(bool rests) { rests_ = rests; }
 
   // Loads the inputs of link(), which stay in registers if each particle has a thread.
   __device__ void load() {
@@ -301,7 +306,7 @@ class ItemStep {
   // all threads; false as gather().
   template <Contacts C>
   __device__ bool load_velocities(const NodeVelocities<C, T, D>& velocities, NodeValue<T, D>* tile,
-                                  int first_out_of_block, int of_tile, int count) const {
+                                  int first_out_of_block, int of_tile, int count) {
     const TileNodes<S> nodes{m, schedule_of(topology()).neighbours, first_out_of_block, of_tile, count};
     SeveralNodes several;
 #pragma unroll 1
@@ -310,7 +315,11 @@ class ItemStep {
       if (node.place < 0) continue;
       Vector<T, D> v = zero_vector<T, D>();
       bool meets_several = false;
-      if (node.slot >= 0) v = velocities.at(nodes.update_of(node, update), node, meets_several);
+      if (node.slot >= 0) {
+        const SlotUpdate<T, D> there = nodes.update_of(node, update);
+        const auto find_touch = [&] { return touch_of<C>(velocities.contact, there, node, i < of_tile); };
+        v = velocities.at(there, node, find_touch, meets_several);
+      }
       if (meets_several) several.add(turn);
       store(v, tile[node.place]);
     }
@@ -319,6 +328,17 @@ class ItemStep {
       if (__syncthreads_or(several.any())) add_contact(nodes, velocities, several, tile);
     __syncthreads();
     return true;
+  }
+
+  // The touch of a node. A thread keeps that of its node of the tile where obstacles rest.
+  template <Contacts C>
+  __device__ NodeTouch<T, D> touch_of(const ContactArguments<T, D>& contact, const SlotUpdate<T, D>& there,
+                                      const TileNode& node, bool of_tile) {
+    static_assert(tile_nodes <= threads);
+    if (C == Contacts::one_surface && of_tile && has_touch_) return touch_;
+    const NodeTouch<T, D> touch = lone_touch(contact, there.scene, there.corner, node.local);
+    if (C == Contacts::one_surface && of_tile && rests_) touch_ = touch, has_touch_ = true;
+    return touch;
   }
 
   __device__ int corner() const {
@@ -351,6 +371,8 @@ class ItemStep {
   ParticleMomentum<T, D> state_;
   typename Source::Parameters parameters_;
   typename Source::Changes changes_;
+  bool rests_ = false, has_touch_ = false;
+  NodeTouch<T, D> touch_;
 };
 
 // Number of used slots from `begin` to `end`; these come first.
@@ -504,7 +526,12 @@ __global__ void __launch_bounds__(ItemStep<Source, Task>::threads, kItemsOfProce
       more = lasts(barrier.wait()) && !a.handover->lost && first < a.steps;
     }
   }
-  if (keeps && more) item.begin(blockIdx.x), item.load(), item.link();
+  if (keeps && more) {
+    item.begin(blockIdx.x);
+    if constexpr (C == Contacts::one_surface) item.set_rest(obstacles_rest(contact, shared.home.scene));
+    item.load();
+    item.link();
+  }
   const auto each_item = [&](const auto& phase) {
     for (int i = blockIdx.x; i < items; i += blocks) {
       if (!alone) item.begin(i);
