@@ -197,6 +197,7 @@ class Copies {
     a.J = {given_[R::J], {1, 0, 0}};
     if (liquid || first.gradient) a.elastic_F = written(a_.elastic_row, D);
     if (liquid || !first.gradient) a.elastic_J = {row(a_.elastic_row + D * D), {1, 0, 0}};
+    a.is_plastic = first.plastic;
     if (liquid || first.plastic) a.next_F = written(R::F, D);
     if (!liquid) return a;
     a.next_J = {row(R::J), {1, 0, 0}};

@@ -35,8 +35,9 @@ struct ThermalLawsArguments {
   // F and J of the material, and those that laws read; those are absent where laws read those of the material.
   Field<const T> F, J;
   Field<T> elastic_F, elastic_J;
-  // F and J after the laws, absent where these do not change them; stress of the material, and of the liquid where it
-  // melts; energy that the solid dissipates, absent where it is not wanted.
+  bool is_plastic = false;  // the law of the solid
+  // F and J after the laws, in place of those before, absent where laws do not change them; stress of the material, and
+  // of the liquid where it melts; energy that the solid dissipates, absent where it is not wanted.
   Field<T> next_F, next_J, stress, dissipated;
   Field<const T> liquid_stress;
 
@@ -80,22 +81,26 @@ MPM_HD void begin_laws_of(const ThermalLawsArguments<T, D>& a, int64_t p) {
   if (a.elastic_J.pointer) store_scalar(at, a.elastic_J, phases.J);
 }
 
+// F of a solid changes by plastic flow, and where it melts; the stress of a solid without liquid is its own.
 template <class T, int D>
 MPM_HD void end_laws_of(const ThermalLawsArguments<T, D>& a, int64_t p) {
   if (!a.members.has(p)) return;
   const One<T> at{p};
-  const T factor = stretch_of(a, at);
-  if (a.next_F.pointer) store_matrix<D>(at, a.next_F, factor * load_matrix<D>(at, constant(a.elastic_F)));
+  const bool melts = a.coherency.knots > 0;
+  const T factor = stretch_of(a, at), fraction = melts ? load_scalar(at, a.fraction) : T(0);
+  const bool flows = melts && fraction >= a.coherency.value[0];
+  if (a.next_F.pointer && (a.is_plastic || flows))
+    store_matrix<D>(at, a.next_F, factor * load_matrix<D>(at, constant(a.elastic_F)));
   if (a.next_J.pointer)
     store_scalar(at, a.next_J, volume_of_stretch<D>(factor) * load_scalar(at, constant(a.elastic_J)));
-  if (!a.liquid_stress.pointer) return;
-  const T fraction = load_scalar(at, a.fraction), coherency = a.coherency.value[0];
+  if (fraction == T(0) && !flows) return;
   const Matrix<T, D> solid = load_matrix<D>(at, constant(a.stress)), liquid = load_matrix<D>(at, a.liquid_stress);
   Matrix<T, D> stress;
   MPM_UNROLL for (int i = 0; i < D; i++) MPM_UNROLL
-    for (int j = 0; j < D; j++) stress[i][j] = stress_of_phases(solid[i][j], liquid[i][j], fraction, coherency);
+    for (int j = 0; j < D; j++)
+      stress[i][j] = stress_of_phases(solid[i][j], liquid[i][j], fraction, a.coherency.value[0]);
   store_matrix<D>(at, a.stress, stress);
-  if (a.dissipated.pointer && fraction >= coherency) store_scalar(at, a.dissipated, T(0));
+  if (a.dissipated.pointer && flows) store_scalar(at, a.dissipated, T(0));
 }
 
 }  // namespace TORCH_MPM_ISA

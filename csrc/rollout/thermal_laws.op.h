@@ -121,6 +121,7 @@ class ThermalLaws {
   void make_buffers(size_t k) {
     ThermalLawsArguments<T, D>& a = materials_[k];
     if (s_.calls[k].melts || (!has_liquid(k) && a.expansion.knots == 0)) return;
+    a.is_plastic = s_.calls[k].law->info.plastic;
     const bool gradient = s_.calls[k].law->info.field == Deformation::gradient;
     if (gradient) a.elastic_F = buffer({a.particles, D, D});
     if (!gradient || has_liquid(k)) a.elastic_J = buffer({a.particles});
