@@ -105,6 +105,10 @@ def check_number(
     return value
 
 
+MOST_COUNT = 2**63 - 1
+"""Of the integers of ops."""
+
+
 def check_count(name: str, value: Any, least: int = 0) -> int:
     """An integer, not a bool."""
     if isinstance(value, bool) or not isinstance(value, (int, numbers.Integral, torch.SymInt)):
@@ -112,6 +116,8 @@ def check_count(name: str, value: Any, least: int = 0) -> int:
     if value < least:
         expected = f"be at least {least}" if least else "not be negative"
         raise ValueError(f"{name} must {expected}, got {value}")
+    if not isinstance(value, torch.SymInt) and value > MOST_COUNT:
+        raise ValueError(f"{name} must be below 2^63, got {value}")
     return value  # type: ignore[return-value]
 
 
