@@ -11,11 +11,13 @@ from .package import gymnasium
 from .pour import Pour
 from .push import Push
 from .roll import Roll
+from .scoop import Scoop
 from .vector import MaterialEnv, Scene
+from .write import Write
 
-__all__ = ["Lift", "MaterialEnv", "Pour", "Push", "Roll", "Scene"]
+__all__ = ["Lift", "MaterialEnv", "Pour", "Push", "Roll", "Scene", "Scoop", "Write"]
 
-TASKS: tuple[type[MaterialEnv], ...] = (Push, Roll, Pour, Lift)
+TASKS: tuple[type[MaterialEnv], ...] = (Push, Roll, Pour, Scoop, Lift, Write)
 
 for task in TASKS:
     gymnasium.register(

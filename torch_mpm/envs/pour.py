@@ -8,8 +8,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..bodies.exchange import Part
-from ..boundaries import Box
 from ..geometry import seed
 from ..geometry.vectors import norm
 from ..grid.grid import Grid
@@ -17,21 +15,12 @@ from ..laws import WeaklyCompressible
 from ..state.state import State
 from ..step.step import Step
 from .vector import MaterialEnv, Scene
+from .vessel import THICK, vessel
 
 UPPER = (1.6, 1.2)  # of the domain from the origin [m]
 WIDTH, DEPTH, LEVEL = 0.24, 0.24, 0.16  # inside of the cup and of the glass, and height of the water in the cup [m]
-THICK = 4  # walls of the cup and of the glass, in cells
 HEIGHT = 0.75  # of the bottom of the cup at first [m]
 LOWEST, HIGHEST = (0.4, 0.6), (1.2, 0.9)  # positions of the cup [m]
-
-
-def vessel(thick: float) -> list[Part]:
-    """Bottom and walls of a vessel [m]; its position is the middle of the bottom inside."""
-    outer = WIDTH + 2 * thick
-    side = 0.5 * (WIDTH + thick)
-    boxes = [((outer, thick), (0.0, -0.5 * thick))]
-    boxes += [((thick, DEPTH + thick), (sign * side, 0.5 * (DEPTH - thick))) for sign in (-1, 1)]
-    return [Part(Box((0.0, 0.0), size, "separate"), at) for size, at in boxes]
 
 
 class Pour(MaterialEnv):
@@ -60,7 +49,7 @@ class Pour(MaterialEnv):
     def __init__(self, num_envs: int = 1, dx: float = 0.03, **options: Any) -> None:
         self.grid = Grid(dx, (0.0, 0.0), UPPER, scenes=num_envs, deterministic=True)
         self.thick = THICK * dx
-        cup, glass = vessel(self.thick), vessel(self.thick)
+        cup, glass = (vessel(WIDTH, DEPTH, self.thick) for _ in range(2))
         step = Step(
             self.grid,
             WeaklyCompressible(bulk_modulus=1e5),
