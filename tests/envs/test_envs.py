@@ -1,7 +1,9 @@
 """Environments: gymnasium's interface, seeds, resets by mask, ends of episodes, failures, rewards and gradients."""
 
+import importlib
 import math
 import re
+import sys
 import warnings
 from typing import Any
 
@@ -447,6 +449,13 @@ def test_pictures_show_the_scenes():
 def test_wrong_options_are_errors(options, message):
     with pytest.raises((TypeError, ValueError), match=message):
         make(**options)
+
+
+def test_a_missing_package_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gymnasium", None)
+    monkeypatch.delitem(sys.modules, "torch_mpm.envs.package")
+    with pytest.raises(ImportError, match=r"gymnasium is not installed: pip install torch-mpm\[envs\]"):
+        importlib.import_module("torch_mpm.envs.package")
 
 
 def test_wrong_calls_are_errors():

@@ -49,14 +49,14 @@ class Lift(MaterialEnv):
 
     def __init__(self, num_envs: int = 1, dx: float = 0.03, **options: Any) -> None:
         self.grid = Grid(dx, (0.0, 0.0, 0.0), UPPER, scenes=num_envs, deterministic=True)
+        self.points = seed.box((0.0, 0.0, 0.0), (SIDE, SIDE, SIDE), self.grid, per_cell=8)
         fingers = [Box((0.0, 0.0, 0.0), FINGER, "separate", friction=1.0) for _ in range(2)]
         walls = Walls("separate", friction=0.5)
         step = Step(self.grid, NeoHookean(E=3e4, nu=0.3), gravity=(0.0, 0.0, -9.81), walls=walls, boundaries=fingers)
         super().__init__(step, fingers, substeps=round(0.6 / dx), dt=dx / 30, **options)
 
     def scene(self, random: np.random.Generator) -> Scene:
-        cube = seed.box((0.0, 0.0, 0.0), (SIDE, SIDE, SIDE), self.grid, per_cell=8)
-        state = State.at_rest(cube, density=1000.0, dtype=self.dtype, device=self.device)
+        state = State.at_rest(self.points, density=1000.0, dtype=self.dtype, device=self.device)
         centre, y = 0.5 * UPPER[0] + random.uniform(-0.03, 0.03), 0.5 * UPPER[1]
         state = state.replace(x=state.x + state.x.new_tensor([centre - 0.5 * SIDE, y - 0.5 * SIDE, 0.0]))
         apart = 0.5 * (SIDE + FINGER[0]) + 0.01

@@ -48,6 +48,7 @@ class Pour(MaterialEnv):
 
     def __init__(self, num_envs: int = 1, dx: float = 0.03, **options: Any) -> None:
         self.grid = Grid(dx, (0.0, 0.0), UPPER, scenes=num_envs, deterministic=True)
+        self.points = seed.box((0.0, 0.0), (WIDTH, LEVEL), self.grid, per_cell=4)
         self.thick = THICK * dx
         cup, glass = (vessel(WIDTH, DEPTH, self.thick) for _ in range(2))
         step = Step(
@@ -60,8 +61,7 @@ class Pour(MaterialEnv):
         super().__init__(step, [cup, glass], substeps=round(0.9 / dx), dt=dx / 45, **options)
 
     def scene(self, random: np.random.Generator) -> Scene:
-        water = seed.box((0.0, 0.0), (WIDTH, LEVEL), self.grid, per_cell=4)
-        state = State.at_rest(water, density=1000.0, dtype=self.dtype, device=self.device)
+        state = State.at_rest(self.points, density=1000.0, dtype=self.dtype, device=self.device)
         left, glass = 0.5, random.uniform(0.9, 1.1)
         state = state.replace(x=state.x + state.x.new_tensor([left - 0.5 * WIDTH, HEIGHT]))
         return Scene(state, [(left, HEIGHT, 0.0), (glass, self.thick, 0.0)])

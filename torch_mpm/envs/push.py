@@ -48,14 +48,14 @@ class Push(MaterialEnv):
 
     def __init__(self, num_envs: int = 1, dx: float = 0.05, **options: Any) -> None:
         self.grid = Grid(dx, (0.0, 0.0), UPPER, scenes=num_envs, deterministic=True)
+        self.points = seed.box((0.0, 0.0), (SIDE, SIDE), self.grid, per_cell=4)
         disc = Sphere((0.0, 0.0), RADIUS, "separate")
         walls = Walls("separate", friction=0.3)
         step = Step(self.grid, NeoHookean(E=2e4, nu=0.3), gravity=(0.0, -9.81), walls=walls, boundaries=[disc])
         super().__init__(step, [disc], substeps=round(1.0 / dx), dt=0.04 * dx, **options)
 
     def scene(self, random: np.random.Generator) -> Scene:
-        lump = seed.box((0.0, 0.0), (SIDE, SIDE), self.grid, per_cell=4)
-        state = State.at_rest(lump, density=1000.0, dtype=self.dtype, device=self.device)
+        state = State.at_rest(self.points, density=1000.0, dtype=self.dtype, device=self.device)
         left = random.uniform(0.3, 0.4)
         state = state.replace(x=state.x + state.x.new_tensor([left, 0.0]))
         return Scene(state, [(left - 1.1 * RADIUS, RADIUS, 0.0)], [left + 0.5 * SIDE + random.uniform(0.2, 0.4)])

@@ -47,14 +47,14 @@ class Roll(MaterialEnv):
 
     def __init__(self, num_envs: int = 1, dx: float = 0.04, **options: Any) -> None:
         self.grid = Grid(dx, (0.0, 0.0), UPPER, scenes=num_envs, deterministic=True)
+        self.points = seed.box((0.0, 0.0), (WIDTH, HEIGHT), self.grid, per_cell=4)
         roller = Sphere((0.0, 0.0), RADIUS, "separate", friction=0.3)
         law = VonMises(E=2e4, nu=0.3, yield_stress=1e3)
         step = Step(self.grid, law, gravity=(0.0, -9.81), walls=Walls("sticky"), boundaries=[roller])
         super().__init__(step, [roller], substeps=round(1.2 / dx), dt=dx / 30, **options)
 
     def scene(self, random: np.random.Generator) -> Scene:
-        dough = seed.box((0.0, 0.0), (WIDTH, HEIGHT), self.grid, per_cell=4)
-        state = State.at_rest(dough, density=1000.0, dtype=self.dtype, device=self.device)
+        state = State.at_rest(self.points, density=1000.0, dtype=self.dtype, device=self.device)
         left = random.uniform(0.4, 0.5)
         state = state.replace(x=state.x + state.x.new_tensor([left, 0.0]))
         return Scene(state, [(left + 0.5 * WIDTH, HEIGHT + 1.1 * RADIUS, 0.0)])

@@ -50,6 +50,7 @@ class Scoop(MaterialEnv):
 
     def __init__(self, num_envs: int = 1, dx: float = 0.025, **options: Any) -> None:
         self.grid = Grid(dx, (0.0, 0.0), UPPER, scenes=num_envs, deterministic=True)
+        self.points = seed.box((0.0, 0.0), BED, self.grid, per_cell=4)
         bucket = vessel(WIDTH, DEPTH, THICK * dx, friction=0.5)
         sand = QuarticSand(E=3e5, nu=0.3, friction_angle=0.6)
         obstacles = [part.obstacle for part in bucket]
@@ -58,8 +59,7 @@ class Scoop(MaterialEnv):
         super().__init__(step, [bucket], substeps=round(1.6 / dx), dt=dx / 80, **options)
 
     def scene(self, random: np.random.Generator) -> Scene:
-        sand = seed.box((0.0, 0.0), BED, self.grid, per_cell=4)
-        state = State.at_rest(sand, density=1600.0, dtype=self.dtype, device=self.device)
+        state = State.at_rest(self.points, density=1600.0, dtype=self.dtype, device=self.device)
         return Scene(state, [(random.uniform(0.4, 0.6), 0.6, -0.5 * math.pi)])
 
     def velocities(self, actions: Tensor) -> Tensor:

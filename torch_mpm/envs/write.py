@@ -60,14 +60,14 @@ class Write(MaterialEnv):
 
     def __init__(self, num_envs: int = 1, dx: float = 0.04, **options: Any) -> None:
         self.grid = Grid(dx, (0.0, 0.0, 0.0), UPPER, scenes=num_envs, deterministic=True)
+        self.points = seed.box((0.0, 0.0, 0.0), (*UPPER[:2], CLAY), self.grid, per_cell=8)
         stylus = Capsule((0.0, 0.0, 0.0), (0.0, 0.0, HALF), RADIUS)
         clay = VonMises(E=2e4, nu=0.3, yield_stress=500.0)
         step = Step(self.grid, clay, gravity=(0.0, 0.0, -9.81), walls=Walls("sticky"), boundaries=[stylus])
         super().__init__(step, [stylus], substeps=round(0.8 / dx), dt=dx / 40, **options)
 
     def scene(self, random: np.random.Generator) -> Scene:
-        clay = seed.box((0.0, 0.0, 0.0), (*UPPER[:2], CLAY), self.grid, per_cell=8)
-        state = State.at_rest(clay, density=1000.0, dtype=self.dtype, device=self.device)
+        state = State.at_rest(self.points, density=1000.0, dtype=self.dtype, device=self.device)
         stroke = LETTERS[random.choice(sorted(LETTERS))]
         stroke = stroke + stroke[-1:] * (CORNERS - len(stroke))
         goal = torch.tensor(stroke, dtype=self.dtype, device=self.device)
