@@ -11,7 +11,8 @@ from torch import Tensor
 
 import torch_mpm as mpm
 from benchmarks.catalogue.scenes import block, unit_box
-from torch_mpm.bodies import Part, RigidBodies, with_velocities
+from torch_mpm.bodies import Part, RigidBodies, moved, with_velocities
+from torch_mpm.bodies.exchange import POSE
 
 DT, N = 1e-3, 5
 
@@ -226,6 +227,23 @@ def test_velocities_of_a_change():
         with_velocities(poses[0][..., :5], poses[1], 0.1)
     with pytest.raises(ValueError, match=r"later must have the dimension of poses, 3, got \[1, 1, 3\]"):
         with_velocities(poses[0], poses[1][..., :3], 0.1)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_moved_poses_are_those_of_scipy(dim):
+    rows = torch.tensor([[motion(dim)]], dtype=F64)
+    found, seconds = moved(rows, 0.3)[0, 0], 0.3
+    columns = POSE[dim]
+    torch.testing.assert_close(found[:dim], (rows[..., :dim] + seconds * rows[..., columns : columns + dim])[0, 0])
+    if dim == 2:
+        assert float(found[2]) == pytest.approx(float(rows[0, 0, 2] + seconds * rows[0, 0, 5]))
+    else:
+        turn = Rotation.from_rotvec(seconds * rows[0, 0, 10:].numpy())
+        expected = turn * Rotation.from_quat(rows[0, 0, 3:7].numpy(), scalar_first=True)
+        assert (expected.inv() * Rotation.from_quat(found[3:].numpy(), scalar_first=True)).magnitude() < 1e-12
+    torch.testing.assert_close(with_velocities(rows, moved(rows, seconds), seconds), rows)
+    with pytest.raises(ValueError, match=rf"bodies must have shape .*, got \[1, 1, {columns}\]"):
+        moved(rows[..., :columns], 0.1)
 
 
 # ---- batches and gradients

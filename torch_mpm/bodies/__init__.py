@@ -4,6 +4,6 @@
 """
 
 from .coupling import MujocoCoupling, couple
-from .exchange import Part, RigidBodies, with_velocities
+from .exchange import Part, RigidBodies, moved, with_velocities
 
-__all__ = ["MujocoCoupling", "Part", "RigidBodies", "couple", "with_velocities"]
+__all__ = ["MujocoCoupling", "Part", "RigidBodies", "couple", "moved", "with_velocities"]

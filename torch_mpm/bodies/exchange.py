@@ -33,7 +33,7 @@ from ..boundaries.obstacles import Obstacle
 from ..cuda_graphs.capture import is_readable
 from ..errors import FLOATING, check_count, check_number, check_vector, shape_of
 from ..geometry.values import filled
-from ..geometry.vectors import composed, rotation_vector
+from ..geometry.vectors import composed, quaternion, rotation_vector
 from ..rollouts import rollout
 from ..state.state import State
 from ..step.step import Step
@@ -247,12 +247,8 @@ def with_velocities(poses: Tensor, later: Tensor, seconds: float) -> Tensor:
         TypeError, ValueError: for another time or shape.
     """
     check_number("seconds", seconds, "positive and finite", lambda v: 0 < v < math.inf)
-    columns = {POSE[dim] + more: dim for dim in POSE for more in (0, VELOCITY[dim])}
-    for name, given in (("poses", poses), ("later", later)):
-        if not isinstance(given, Tensor) or given.dim() != 3 or given.shape[2] not in columns:
-            raise ValueError(f"{name} must have shape [B, K, 7] or [B, K, 13], or 3 or 6 in 2-D, got {shape_of(given)}")
-    dim = columns[poses.shape[2]]
-    if columns[later.shape[2]] != dim:
+    dim = _dim_of("poses", poses, 0, 1)
+    if _dim_of("later", later, 0, 1) != dim:
         raise ValueError(f"later must have the dimension of poses, {dim}, got {shape_of(later)}")
     pose = poses[..., : POSE[dim]]
     if dim == 2:
@@ -261,6 +257,38 @@ def with_velocities(poses: Tensor, later: Tensor, seconds: float) -> Tensor:
         return torch.cat([pose, change[..., :2] / seconds, turn / seconds], -1)
     begin, end = (rotation_vector(p[..., 3:4], p[..., 4:7]) for p in (pose, later))
     return torch.cat([pose, (later[..., :3] - pose[..., :3]) / seconds, composed(end, -begin) / seconds], -1)
+
+
+def moved(bodies: Tensor, seconds: float) -> Tensor:
+    """Poses to which constant velocities lead; differentiable.
+
+    Args:
+        bodies: poses and velocities [B, K, 13] (3-D) or [B, K, 6] (2-D).
+        seconds: the time in between [s].
+
+    Returns:
+        [B, K, 7] (3-D) or [B, K, 3] (2-D).
+
+    Raises:
+        TypeError, ValueError: for another time or shape.
+    """
+    check_number("seconds", seconds)
+    dim = _dim_of("bodies", bodies, 1)
+    if dim == 2:
+        return bodies[..., :3] + seconds * bodies[..., 3:]
+    motion = motion_of(bodies, dim)
+    turned = quaternion(composed(seconds * motion.angular_velocity, motion.rotation))
+    return torch.cat([motion.position + seconds * motion.velocity, *turned], -1)
+
+
+def _dim_of(name: str, bodies: Tensor, *velocities: int) -> int:
+    """Dimension of poses without (0) or with (1) velocities."""
+    columns = {POSE[dim] + more * VELOCITY[dim]: dim for dim in POSE for more in velocities}
+    if not isinstance(bodies, Tensor) or bodies.dim() != 3 or bodies.shape[2] not in columns:
+        three_d = " or ".join(f"[B, K, {n}]" for n, dim in columns.items() if dim == 3)
+        two_d = " or ".join(str(n) for n, dim in columns.items() if dim == 2)
+        raise ValueError(f"{name} must have shape {three_d}, or {two_d} in 2-D, got {shape_of(bodies)}")
+    return columns[bodies.shape[2]]
 
 
 def _parts_of(k: int, body: Obstacle | Part | Sequence[Obstacle | Part]) -> list[Part]:

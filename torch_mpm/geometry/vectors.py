@@ -23,7 +23,7 @@ def composed(a: Tensor, b: Tensor) -> Tensor:
 
     Twice differentiable where the angle is below π.
     """
-    (p, u), (q, v) = _quaternion(a), _quaternion(b)
+    (p, u), (q, v) = quaternion(a), quaternion(b)
     scalar = p * q - (u * v).sum(-1, keepdim=True)
     vector = p * v + q * u + torch.linalg.cross(*torch.broadcast_tensors(u, v))
     return rotation_vector(scalar, vector)
@@ -41,8 +41,8 @@ def rotation_vector(scalar: Tensor, vector: Tensor) -> Tensor:
     return 2 * vector * torch.where(small, 1.0, torch.atan2(half, scalar) / torch.where(small, 1.0, half))
 
 
-def _quaternion(turn: Tensor) -> tuple[Tensor, Tensor]:
-    """Scalar [..., 1] and vector [..., 3] of a rotation vector."""
+def quaternion(turn: Tensor) -> tuple[Tensor, Tensor]:
+    """Scalar [..., 1] and vector [..., 3] of the quaternion of a rotation vector."""
     half = 0.5 * norm(turn)[..., None]
     share = torch.where(half > 0, half.sin() / torch.where(half > 0, half, 1), 1)
     return half.cos(), 0.5 * share * turn

@@ -1,0 +1,52 @@
+"""Arguments of `MaterialEnv.reset` and of its constructor, checked by name."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from torch import Tensor
+
+from .package import AutoresetMode
+
+MODES = {mode.value: mode for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED)}
+MASK = "reset_mask"
+
+
+def autoreset_mode(given: Any) -> Any:
+    """A mode of gymnasium by itself or by its value; ValueError for another one."""
+    mode = given if isinstance(given, AutoresetMode) else MODES.get(given)
+    if mode not in MODES.values():
+        raise ValueError(f"autoreset_mode must be one of {sorted(MODES)}, got {getattr(given, 'value', given)!r}")
+    return mode
+
+
+def reset_mask(options: dict[str, Any] | None, scenes: int) -> npt.NDArray[np.bool_]:
+    """Scenes to reset, bool [B]: all without options; TypeError, ValueError for other options."""
+    options = {} if options is None else options
+    if not isinstance(options, dict):
+        raise TypeError(f"options must be a dictionary, got {type(options).__name__}")
+    if unknown := sorted(str(key) for key in options if key != MASK):
+        raise ValueError(f"options must have the key {MASK!r} only, got {unknown[0]!r}")
+    if MASK not in options:
+        return np.ones(scenes, dtype=bool)
+    given = options[MASK]
+    mask = given.cpu().numpy() if isinstance(given, Tensor) else given
+    if not isinstance(mask, np.ndarray) or mask.dtype != bool or mask.shape != (scenes,):
+        kind = f"{mask.dtype} {list(mask.shape)}" if isinstance(mask, np.ndarray) else type(mask).__name__
+        raise ValueError(f"{MASK} must be bool [B] = [{scenes}], got {kind}")
+    return mask
+
+
+def seeds_of_scenes(seed: Any, scenes: int) -> list[int | None]:
+    """Seeds of the scenes, those of a list or consecutive numbers; TypeError, ValueError for another seed."""
+    seeds = list(seed) if isinstance(seed, Sequence) else [seed] * scenes
+    if len(seeds) != scenes:
+        raise ValueError(f"seed must be a number or a list of {scenes}, got {len(seeds)}")
+    for one in seeds:
+        if one is not None and (isinstance(one, bool) or not isinstance(one, (int, np.integer)) or one < 0):
+            raise ValueError(f"seed must be a whole number >= 0, or a list of such numbers and None, got {one!r}")
+    first = not isinstance(seed, Sequence)
+    return [None if one is None else int(one) + first * b for b, one in enumerate(seeds)]

@@ -1,0 +1,50 @@
+"""Scenes of a step that fail: reasons in words, and no gradient."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from ..step.failures import Failures
+
+
+class GradientGate:
+    """Inputs of a step of B scenes, with gradients from it that are zero in scenes that turned out to fail.
+
+    Zero times a NaN is a NaN in the backward pass of such a scene, which would spoil weights that all scenes share.
+    """
+
+    def __init__(self) -> None:
+        self.failed: Tensor | None = None
+        """Scenes that failed, bool [B]; None for no scene. It is assigned after the step, before the backward pass."""
+
+    def __call__(self, value: Tensor) -> Tensor:
+        """An input whose rows belong to the scenes in equal numbers, scene after scene."""
+        if not value.requires_grad:
+            return value
+        gated = value.view_as(value)
+        gated.register_hook(self._gradient)
+        return gated
+
+    def _gradient(self, gradient: Tensor) -> Tensor:
+        if self.failed is None:
+            return gradient
+        failed = self.failed.repeat_interleave(len(gradient) // len(self.failed))
+        return torch.where(failed.reshape(-1, *(1,) * (gradient.dim() - 1)), 0.0, gradient)
+
+
+def reasons(failures: Failures, failed: npt.NDArray[np.bool_]) -> dict[str, Any]:
+    """Information about scenes that failed, bool [B] on the host; empty without one."""
+    if not failed.any():
+        return {}
+    reason = np.full(len(failed), None, dtype=object)
+    for b in np.flatnonzero(failed):
+        others = [k != b for k in range(len(failed))]
+        problems = (*failures.given.values(), *failures.problems.values())
+        found = [sentence for problem in problems if (sentence := problem.sentence(others))]
+        reason[b] = "; ".join(found) or "the observation or the score is not finite"
+    return {"failed": torch.as_tensor(failed, device=failures.failed.device), "reason": reason, "_reason": failed}
