@@ -116,7 +116,7 @@ def check_count(name: str, value: Any, least: int = 0) -> int:
     if value < least:
         expected = f"be at least {least}" if least else "not be negative"
         raise ValueError(f"{name} must {expected}, got {value}")
-    if not isinstance(value, torch.SymInt) and value > MOST_COUNT:
+    if isinstance(value, int) and value > MOST_COUNT:
         raise ValueError(f"{name} must be below 2^63, got {value}")
     return value  # type: ignore[return-value]
 
