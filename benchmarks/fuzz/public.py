@@ -91,6 +91,14 @@ def _rollouts() -> dict[str, Callable[[], Call]]:
         function, given = environments()
         return _limited(function(**given).advance), dict(n=2, dt=torch.tensor([1e-4, 2e-4, 2e-4]))
 
+    def of_bodies() -> Call:
+        w = _World()
+        grid, state = w.batch()
+        ball = mpm.Sphere((0.5, 0.5), 0.2)
+        step = mpm.Step(grid, w.law, boundaries=[ball])
+        poses = torch.zeros(grid.scenes, 1, 6, dtype=torch.float64)
+        return _limited(mpm.RigidBodies(step, [ball]).advance), dict(state=state, bodies=poses, n=2, dt=1e-4)
+
     def method(name: str, /, **given: Any) -> Callable[[], Call]:
         def make() -> Call:
             w = _World()
@@ -117,6 +125,7 @@ def _rollouts() -> dict[str, Callable[[], Call]]:
         "substeps_arguments": taken(mpm.substeps_arguments, n=2, dt=1e-4, records=True, blocks=27),
         "Environments": environments,
         "Environments.advance": advanced,
+        "RigidBodies.advance": of_bodies,
         "Checkpoints": lambda: (mpm.Checkpoints, dict(every=2, offload=False)),
         "GradientNorms": lambda: (mpm.GradientNorms, dict(every=2)),
         "Step.stable_dt": method("stable_dt", cfl=0.5),

@@ -21,7 +21,7 @@ from torch import Tensor
 from ..errors import SimulationError, check_count, check_number, shape_of
 from ..ops.impulses import with_moment
 from ..rollouts import rollout
-from ..state.state import State
+from ..state.state import State, check_state
 from ..step.step import Step
 from .exchange import RigidBodies, with_velocities
 from .fixed_point import FixedPoint
@@ -144,6 +144,7 @@ class MujocoCoupling:
                 needs more than 100 000 substeps.
         """
         n = check_count("n", n) if seconds is None else self._steps_in(seconds)
+        check_state(state)
         _refuse_gradients(self.step, state)
         if state.impulse is None:
             state = self.step.with_impulses(state)

@@ -34,8 +34,9 @@ from ..cuda_graphs.capture import is_readable
 from ..errors import FLOATING, check_count, check_number, check_vector, shape_of
 from ..geometry.values import filled
 from ..geometry.vectors import composed, quaternion, rotation_vector
+from ..ops.arguments import split_dt
 from ..rollouts import rollout
-from ..state.state import State
+from ..state.state import State, check_state
 from ..step.step import Step
 
 NOT_UNIT = 1e-3
@@ -142,6 +143,7 @@ class RigidBodies:
             TypeError, ValueError: for another shape, dtype or device, and on the CPU for numbers that are not finite
                 and quaternions whose length differs from 1 by more than a thousandth.
         """
+        check_state(state)
         self._check(bodies, state)
         dim = self.step.grid.dim
         owner, position, rotation = (values.to(bodies.device, non_blocking=True) for values in self._frames)
@@ -168,6 +170,8 @@ class RigidBodies:
         Raises:
             ValueError: for states that count no impulses, or points of another shape.
         """
+        check_state(before)
+        check_state(after)
         on = self.step.impulses(after) - self.step.impulses(before)
         rows, dim, scenes = [], self.step.grid.dim, self.step.grid.scenes
         if about is not None and (about.dim() != 3 or about.shape[:2] != (scenes, len(self)) or about.shape[2] < dim):
@@ -196,6 +200,8 @@ class RigidBodies:
             TypeError, ValueError: as `move` and `rollout`.
         """
         check_count("n", n, 1)
+        check_state(state)
+        split_dt(dt, self.step.grid.scenes, state.x)  # Checks dt.
         if state.impulse is None:
             state = self.step.with_impulses(state)
         self.move(bodies, state)

@@ -133,7 +133,7 @@ def _fake(
 def _columns_of_heat(given: dict[str, Any], dim: int) -> int:
     """Temperature, gradient, liquid fraction, present volume and dissipated energy."""
     count = len(given["heat"])
-    return 2 + (dim if count % 3 == 1 else 0) + (count >= 6) + (given["heat_scalars"][2] > 0)
+    return 2 + (dim if count % 3 == 1 else 0) + (count >= 6) + any(share > 0 for share in given["heat_scalars"][2:3])
 
 
 def _fake_record(x: Tensor) -> Tensor:
