@@ -395,6 +395,16 @@ def test_paths_that_refuse_what_stands_for_a_time():
 # ---- rotations
 
 
+@pytest.mark.parametrize("dt", [None, "1e-4"])
+def test_wrong_dt_is_named(dt):
+    """Before the motion of obstacles is computed with it."""
+    step = mpm.Step(grid_of(), mpm.NeoHookean(E=1e4, nu=0.3), boundaries=[box((0.5, 0.5))])
+    state = step.prepare(block())
+    for run in (lambda: step(state, dt), lambda: mpm.rollout(step, state, 2, dt)):
+        with pytest.raises(TypeError, match="dt must be a number of seconds or a tensor"):
+            run()
+
+
 @pytest.mark.parametrize("form", ["tensor", "numbers", "scenes"])
 @pytest.mark.parametrize("dim", [2, 3])
 def test_assigned_rotations_turn(dim, form, device):

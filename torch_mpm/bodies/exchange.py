@@ -34,7 +34,6 @@ from ..cuda_graphs.capture import is_readable
 from ..errors import FLOATING, check_count, check_number, check_vector, shape_of
 from ..geometry.values import filled
 from ..geometry.vectors import composed, quaternion, rotation_vector
-from ..ops.arguments import split_dt
 from ..rollouts import rollout
 from ..state.state import State, check_state
 from ..step.step import Step
@@ -201,7 +200,6 @@ class RigidBodies:
         """
         check_count("n", n, 1)
         check_state(state)
-        split_dt(dt, self.step.grid.scenes, state.x)  # Checks dt.
         if state.impulse is None:
             state = self.step.with_impulses(state)
         self.move(bodies, state)

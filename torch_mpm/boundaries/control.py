@@ -24,6 +24,7 @@ from torch import Tensor
 from ..cuda_graphs.capture import Remembered, as_remembered, is_captured, is_same, is_traced
 from ..geometry.values import filled
 from ..geometry.vectors import composed, norm
+from ..ops.arguments import check_kind_of_dt
 from .motion import PACE, RigidMotion
 
 if TYPE_CHECKING:
@@ -149,6 +150,7 @@ def control_step(
         seconds: duration of the steps [s], if that is not n dt.
 
     Raises:
+        TypeError: for a dt that is neither a number nor a tensor.
         ValueError: on the CPU, where a velocity contradicts the change of a pose. On CUDA the status counts it.
     """
     obstacles = [] if n == 0 or torch.compiler.is_compiling() or _THREAD.steady else obstacles_of(step)
@@ -159,6 +161,7 @@ def control_step(
         return _NO_CONTROL
     if any(o.course is not None for o in obstacles):
         return _inside(step, obstacles, state, dt)
+    check_kind_of_dt(dt)
     return _control_step(step, obstacles, state, Span(state.time, n * dt if seconds is None else seconds, dt))
 
 

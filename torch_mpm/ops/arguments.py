@@ -13,6 +13,12 @@ from ..cuda_graphs.capture import is_traced
 from ..errors import LARGEST, REAL, check_like, shape_of
 
 
+def check_kind_of_dt(dt: Any) -> None:
+    """Raise TypeError for anything but a number or a tensor."""
+    if not isinstance(dt, (Tensor, *REAL)):
+        raise TypeError(f"dt must be a number of seconds or a tensor, got {type(dt).__name__} {dt!r}")
+
+
 def split_dt(dt: float | Tensor, scenes: int, x: Tensor) -> tuple[float, Tensor | None]:
     """Time step [s] as an argument of ops: a number times an optional tensor [B].
 
@@ -24,9 +30,8 @@ def split_dt(dt: float | Tensor, scenes: int, x: Tensor) -> tuple[float, Tensor 
         ValueError: for a number that is not positive and finite in the dtype of x, or a wrong shape or device. Values
             of a tensor are not read, so that the device is not synchronised.
     """
+    check_kind_of_dt(dt)
     if not isinstance(dt, Tensor):
-        if not isinstance(dt, REAL):
-            raise TypeError(f"dt must be a number of seconds or a tensor, got {type(dt).__name__} {dt!r}")
         if not 0 < dt <= LARGEST.get(x.dtype, math.inf):
             raise ValueError(f"dt must be a positive number of seconds, got {dt} in {x.dtype}")
         return float(dt), None
