@@ -245,8 +245,9 @@ struct Substeps {
 
   // Computes the stress, if P2G does not.
   void run_laws(backend::Stream stream) {
-    for (size_t k = 0; k < laws.size() && !fused; k++) calls[k].law->kernels<T, D>().update(laws[k], stream);
+    for (size_t k = 0; k < laws.size() && !fused; k++) run_law(k, stream);
   }
+  void run_law(size_t k, backend::Stream stream) const { calls[k].law->kernels<T, D>().update(laws[k], stream); }
 
   // Moves the particles, after their laws; the time of the obstacles stays that of the step.
   void move(backend::Stream stream) {

@@ -98,7 +98,7 @@ class ThermalLaws {
     for (size_t k = 0; k < materials_.size(); k++) {
       const ThermalLawsArguments<T, D>& a = materials_[s_.calls[k].melts ? k - 1 : k];
       if (!s_.calls[k].melts && a.begins()) backend::begin_thermal_laws(a, stream);
-      s_.calls[k].law->template kernels<T, D>().update(s_.laws[k], stream);
+      s_.run_law(k, stream);
       if (!has_liquid(k) && a.ends()) backend::end_thermal_laws(a, stream);
     }
   }

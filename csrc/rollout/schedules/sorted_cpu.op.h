@@ -209,7 +209,7 @@ void SortedCpu<T, D>::find_thermal() {
   const auto rows = [this](int count) { return std::exchange(copied_rows_, copied_rows_ + count); };
   if (s_.melts || expands) a_.elastic_row = rows(D * D + 1);
   if (s_.melts) a_.liquid_row = rows(D * D);
-  if (heat && heat->dissipated_column() >= 0) a_.dissipated_row = copied_rows_++;
+  if (heat && heat->heats_by_laws()) a_.dissipated_row = copied_rows_++;
 }
 
 // Copies a column of heat to a row, and back if it is written.
