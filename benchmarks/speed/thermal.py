@@ -12,7 +12,7 @@ fixed length.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -86,17 +86,19 @@ ROWS: dict[str, tuple[str | None, Callable[[Setup], Setup]]] = {
 """Rows with the row that each stands beside, and cubes made from the neo-Hookean one."""
 
 
-def of_cubes(device: str, sides: tuple[int, ...], samples: int) -> Iterator[dict[str, Any]]:
-    for side in sides:
-        plain, times = setup(work.make(side), device), {}
-        for name, (beside, make) in ROWS.items():
-            row = rollouts.per_step(make(plain), device, samples)
-            times[name] = row["us"]
-            yield {"name": name, **row, **compared(row, beside, times)}
+def beside_each_other(plain: Setup, names: Iterable[str], device: str, samples: int) -> Iterator[dict[str, Any]]:
+    """Rows of ROWS for a neo-Hookean cube, or for a batch of them."""
+    scenes, times = plain.step.grid.scenes, {}
+    for name in names:
+        beside, make = ROWS[name]
+        row = rollouts.per_step(make(plain), device, samples)
+        times[name] = row["us"]
+        compared = {} if beside is None else {"beside": beside, "times": row["us"] / times[beside]}
+        yield {"name": named(name, scenes), **row, **compared}
 
 
-def compared(row: dict[str, Any], beside: str | None, times: dict[str, float]) -> dict[str, Any]:
-    return {} if beside is None else {"beside": beside, "times": row["us"] / times[beside]}
+def named(name: str, scenes: int) -> str:
+    return name if scenes == 1 else f"{name}, {scenes} scenes"
 
 
 def until_a_time(s: Setup, device: str, samples: int) -> dict[str, Any]:
@@ -110,24 +112,25 @@ def until_a_time(s: Setup, device: str, samples: int) -> dict[str, Any]:
         substeps = int(result.substeps.max())
         best = rollouts.least(device, lambda: mpm.rollout_to(s.step, state, end), samples) / substeps
         fixed = rollouts.least(device, lambda: mpm.rollout(s.step, state, substeps, end / substeps), samples) / substeps
-    name = "until a time" if scenes == 1 else f"until a time, {scenes} scenes"
-    row = {"name": name, "particles": len(state), "steps": substeps, "us": best * 1e6, "rate": len(state) / best}
+    row = {
+        "name": named("until a time", scenes),
+        "particles": len(state),
+        "steps": substeps,
+        "us": best * 1e6,
+        "rate": len(state) / best,
+    }
     return {**row, "beside": f"fixed dt, {fixed * 1e6:.3g} us", "times": best / fixed}
 
 
 def measure(device: str, quick: bool = False) -> dict[str, Any]:
     common.use_all_cores()
     samples = 1 if quick else 5
-    rows = list(of_cubes(device, (6,) if quick else SIDES[device], samples))
+    rows: list[dict[str, Any]] = []
+    for side in (6,) if quick else SIDES[device]:
+        rows += beside_each_other(setup(work.make(side), device), ROWS, device, samples)
     batches = ((4, 64),) if quick else BATCHES[device]
-    for scenes, particles in batches:
-        times: dict[str, float] = {}
-        plain = rollouts.batched(scenes, particles, device)
-        for name, make in (("neo-Hookean", lambda s: s), ("heat", heated)):
-            row = rollouts.per_step(make(plain), device, samples)
-            times[name] = row["us"]
-            beside = compared(row, None if name == "neo-Hookean" else "neo-Hookean", times)
-            rows.append({"name": f"{name}, {scenes} scenes", **row, **beside})
+    for batch in batches:
+        rows += beside_each_other(rollouts.batched(*batch, device), ("neo-Hookean", "heat"), device, samples)
     for side in (6,) if quick else TIMED_SIDES[device]:
         rows.append(until_a_time(setup(work.make(side), device), device, samples))
     rows += [until_a_time(rollouts.batched(*batch, device), device, samples) for batch in batches]

@@ -58,7 +58,7 @@ class FreeBody:
 
 
 def dumbbell(dim: int, kind: str) -> list[Part]:
-    """Two obstacles on a body, of which one is turned."""
+    """Two obstacles on a body; one of them is turned."""
     out = (0.12, 0.0, 0.0)[:dim]
     ball, box = (
         mpm.Sphere((0.0,) * dim, 0.1, kind, friction=0.2),

@@ -38,8 +38,8 @@ class Write(MaterialEnv):
 
     Action [3]: velocity of the stylus, in units of 1 m/s.
 
-    Observation [12]: position of the stylus [m], corners of the stroke of the letter [m], of which the last is repeated
-    to four, and the score.
+    Observation [12]: position of the stylus [m], four corners of the stroke of the letter [m], and the score. The last
+    corner is repeated for a letter with fewer.
 
     Score: −(mean of max(z − 0.06 m, 0) (1 − d / r) over the particles with d < r), with the height z of a particle, its
     distance d from the stroke on the floor, and the radius r of the stylus; over its first absolute value. It is −1 for
