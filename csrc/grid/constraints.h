@@ -1,6 +1,7 @@
 #pragma once
 
 #include <limits>
+#include <type_traits>
 
 #include "common/warp.h"
 #include "grid/friction.h"
@@ -32,72 +33,75 @@ struct Constraints {
   Constraint<S, D> e[most];
 };
 
+// The functions below have the number N of constraints where the compiler knows it, and otherwise 0. With N their loops
+// are unrolled, so that a device keeps their arrays in registers.
+template <int N, class S, int D>
+MPM_HD int number_of(const Constraints<S, D>& c) {
+  return N > 0 ? N : c.count;
+}
+
 // Solves the system of a positive definite matrix of order n in place; false where it is nearly singular.
-template <class S, int D>
-MPM_HD bool solve_definite(S (&g)[D][D], S (&x)[D], int n) {
+template <int N, class S, int M>
+MPM_HD bool solve_definite(S (&g)[M][M], S (&x)[M], int n) {
   constexpr double least = 1e-3;  // of the square of the sine between unit vectors
-  MPM_LOOP for (int k = 0; k < n; k++) {
+  MPM_LOOP_OF(N) for (int k = 0; k < n; k++) {
     if (!(g[k][k] > S(least))) return false;
-    MPM_LOOP for (int i = k + 1; i < n; i++) {
+    MPM_LOOP_OF(N) for (int i = k + 1; i < n; i++) {
       const S factor = g[i][k] / g[k][k];
-      MPM_LOOP for (int j = k; j < n; j++)
-        g[i][j] = g[i][j] - factor * g[k][j];
+      MPM_LOOP_OF(N) for (int j = k; j < n; j++) g[i][j] = g[i][j] - factor * g[k][j];
       x[i] = x[i] - factor * x[k];
     }
   }
-  MPM_LOOP for (int k = n - 1; k >= 0; k--) {
-    MPM_LOOP for (int j = k + 1; j < n; j++)
-      x[k] = x[k] - g[k][j] * x[j];
+  MPM_LOOP_OF(N) for (int k = n - 1; k >= 0; k--) {
+    MPM_LOOP_OF(N) for (int j = k + 1; j < n; j++) x[k] = x[k] - g[k][j] * x[j];
     x[k] = x[k] / g[k][k];
   }
   return true;
 }
 
-// x with N_A x = b for the Gram matrix N of the normals of a set A; the entries of others are zero.
-template <class S, int D>
+// x with G_A x = b for the Gram matrix G of the normals of a set A; the entries of others are zero.
+template <int N, class S, int D>
 MPM_HD bool solve_normals(const Constraints<S, D>& c, unsigned set, S (&b)[Constraints<S, D>::most]) {
-  int member[D], n = 0;
-  MPM_LOOP for (int i = 0; i < c.count; i++) {
-    if (!(set >> i & 1)) {
-      b[i] = S(0);
-      continue;
-    }
-    if (n == D) return false;
-    member[n++] = i;
+  constexpr int most = Constraints<S, D>::most;
+  const int count = number_of<N>(c);
+  S gram[most][most];
+  int members = 0;
+  MPM_LOOP_OF(N) for (int i = 0; i < count; i++) {
+    const bool has_i = set >> i & 1;
+    members += has_i;
+    if (!has_i) b[i] = S(0);
+    MPM_LOOP_OF(N)
+    for (int j = 0; j < count; j++) gram[i][j] =
+        has_i && (set >> j & 1) ? dot(c.e[i].normal, c.e[j].normal) : S(i == j ? 1 : 0);
   }
-  S gram[D][D], x[D];
-  MPM_LOOP for (int i = 0; i < n; i++) {
-    x[i] = b[member[i]];
-    MPM_LOOP for (int j = 0; j < n; j++)
-      gram[i][j] = dot(c.e[member[i]].normal, c.e[member[j]].normal);
-  }
-  if (!solve_definite<S, D>(gram, x, n)) return false;
-  MPM_LOOP for (int i = 0; i < n; i++)
-    b[member[i]] = x[i];
-  return true;
+  return members <= D && solve_definite<N, S, most>(gram, b, count);
 }
 
 // What each surface stops of a velocity v, λ, and the set of those that are met exactly. Of all sets that with the
-// least violation counts: zero, but for rounding or where normals are nearly dependent.
-template <class S, int D>
+// least violation counts: zero, but for rounding or where normals are nearly dependent. The search begins with the
+// surfaces that v runs into, which are the set in most cases.
+template <int N, class S, int D>
 MPM_HD unsigned stopped_velocities(const Constraints<S, D>& c, const Vector<S, D>& v,
                                    S (&lambda)[Constraints<S, D>::most]) {
   using T = ValueOf<S>;
+  const int count = number_of<N>(c);
   constexpr T unmet = std::numeric_limits<T>::min();  // an equality counts as unmet where it is not in the set
   T least = std::numeric_limits<T>::max();
-  unsigned best = 0;
-  MPM_LOOP for (int i = 0; i < c.count; i++)
+  unsigned best = 0, first = 0;
+  MPM_LOOP_OF(N) for (int i = 0; i < count; i++) {
     lambda[i] = S(0);
-  MPM_LOOP for (unsigned set = 0; set < 1u << c.count && least > T(0); set++) {
+    const T approach = value_of(dot(c.e[i].normal, c.e[i].velocity + S(-1) * v));
+    first |= unsigned(c.e[i].kind != Contact::separate || approach > T(0)) << i;
+  }
+  MPM_LOOP for (unsigned other = 0; other < 1u << count && least > T(0); other++) {
+    const unsigned set = first ^ other;
     S trial[Constraints<S, D>::most];
-    MPM_LOOP for (int i = 0; i < c.count; i++)
-      trial[i] = dot(c.e[i].normal, c.e[i].velocity + S(-1) * v);
-    if (!solve_normals<S, D>(c, set, trial)) continue;
+    MPM_LOOP_OF(N) for (int i = 0; i < count; i++) trial[i] = dot(c.e[i].normal, c.e[i].velocity + S(-1) * v);
+    if (!solve_normals<N, S, D>(c, set, trial)) continue;
     Vector<S, D> after = v;
-    MPM_LOOP for (int i = 0; i < c.count; i++)
-      after = after + trial[i] * c.e[i].normal;
+    MPM_LOOP_OF(N) for (int i = 0; i < count; i++) after = after + trial[i] * c.e[i].normal;
     T violation = T(0);
-    MPM_LOOP for (int i = 0; i < c.count; i++) {
+    MPM_LOOP_OF(N) for (int i = 0; i < count; i++) {
       const bool one_sided = c.e[i].kind == Contact::separate, met = set >> i & 1;
       const T missing = value_of(dot(c.e[i].normal, c.e[i].velocity + S(-1) * after));
       const T own = met ? (one_sided ? T(0) - value_of(trial[i]) : T(0)) : one_sided ? missing : abs(missing) + unmet;
@@ -106,20 +110,20 @@ MPM_HD unsigned stopped_velocities(const Constraints<S, D>& c, const Vector<S, D
     if (!(violation < least)) continue;
     least = violation;
     best = set;
-    MPM_LOOP for (int i = 0; i < c.count; i++)
-      lambda[i] = trial[i];
+    MPM_LOOP_OF(N) for (int i = 0; i < count; i++) lambda[i] = trial[i];
   }
   return best;
 }
 
 // Adds the change of a velocity v by friction along the surfaces of a set that stop λ, in parts by surface.
-template <class S, int D>
+template <int N, class S, int D>
 MPM_HD void add_friction(const Constraints<S, D>& c, unsigned set, const S (&lambda)[Constraints<S, D>::most],
                          const Vector<S, D>& v, Vector<S, D> (&change)[Constraints<S, D>::most]) {
+  const int count = number_of<N>(c);
   S limit[Constraints<S, D>::most], sum = S(0);
   Vector<S, D> surface = zero_vector<S, D>();
   bool rubs = false;
-  MPM_LOOP for (int i = 0; i < c.count; i++) {
+  MPM_LOOP_OF(N) for (int i = 0; i < count; i++) {
     limit[i] = S(0);
     if (!(lambda[i] > S(0)) || !has_friction(c.e[i].friction)) continue;
     rubs = true;
@@ -132,28 +136,39 @@ MPM_HD void add_friction(const Constraints<S, D>& c, unsigned set, const S (&lam
     surface = (S(1) / sum) * surface;
   } else {  // a coefficient of zero whose derivative is wanted
     surface = zero_vector<S, D>();
-    MPM_LOOP for (int i = 0; i < c.count; i++) {
+    MPM_LOOP_OF(N) for (int i = 0; i < count; i++) {
       if (lambda[i] > S(0) && has_friction(c.e[i].friction)) surface = c.e[i].velocity;
     }
   }
   const Vector<S, D> u = v + S(-1) * surface;
   S normal[Constraints<S, D>::most];
-  MPM_LOOP for (int i = 0; i < c.count; i++)
-    normal[i] = dot(c.e[i].normal, u);
-  if (!solve_normals<S, D>(c, set, normal)) return;
+  MPM_LOOP_OF(N) for (int i = 0; i < count; i++) normal[i] = dot(c.e[i].normal, u);
+  if (!solve_normals<N, S, D>(c, set, normal)) return;
   Vector<S, D> tangential = u;
-  MPM_LOOP for (int i = 0; i < c.count; i++)
-    tangential = tangential + (S(0) - normal[i]) * c.e[i].normal;
+  MPM_LOOP_OF(N) for (int i = 0; i < count; i++) tangential = tangential + (S(0) - normal[i]) * c.e[i].normal;
   const S squared = dot(tangential, tangential);
   if (!(squared > S(0))) return;
   const S speed = sqrt(squared);
   if (!(sum < speed)) {
-    MPM_LOOP for (int i = 0; i < c.count; i++)
-      change[i] = change[i] + (S(0) - limit[i] / sum) * tangential;
+    MPM_LOOP_OF(N) for (int i = 0; i < count; i++) change[i] = change[i] + (S(0) - limit[i] / sum) * tangential;
     return;
   }
-  MPM_LOOP for (int i = 0; i < c.count; i++)
-    change[i] = change[i] + (S(0) - limit[i] / speed) * tangential;
+  MPM_LOOP_OF(N) for (int i = 0; i < count; i++) change[i] = change[i] + (S(0) - limit[i] / speed) * tangential;
+}
+
+// Changes of a velocity v by surfaces that are not sticky.
+template <int N, class S, int D>
+MPM_HD void changes_of_several(const Constraints<S, D>& c, const Vector<S, D>& v,
+                               Vector<S, D> (&change)[Constraints<S, D>::most]) {
+  const int count = number_of<N>(c);
+  S lambda[Constraints<S, D>::most];
+  const unsigned set = stopped_velocities<N>(c, v, lambda);
+  Vector<S, D> after = v;
+  MPM_LOOP_OF(N) for (int i = 0; i < count; i++) {
+    change[i] = lambda[i] * c.e[i].normal;
+    after = after + change[i];
+  }
+  add_friction<N>(c, set, lambda, after, change);
 }
 
 // Changes of a velocity v by each surface.
@@ -173,14 +188,11 @@ MPM_HD void changes_of_constraints(const Constraints<S, D>& c, const Vector<S, D
     change[0] = contact_velocity(only.kind, u, only.normal, only.friction) + S(-1) * u;
     return;
   }
-  S lambda[Constraints<S, D>::most];
-  const unsigned set = stopped_velocities<S, D>(c, v, lambda);
-  Vector<S, D> after = v;
-  MPM_LOOP for (int i = 0; i < c.count; i++) {
-    change[i] = lambda[i] * c.e[i].normal;
-    after = after + change[i];
+  if constexpr (std::is_floating_point_v<S>) {  // These are short enough to be compiled twice.
+    if (c.count == 2) return changes_of_several<2>(c, v, change);
+    if (c.count == 3) return changes_of_several<3>(c, v, change);
   }
-  add_friction<S, D>(c, set, lambda, after, change);
+  changes_of_several<0>(c, v, change);
 }
 
 // The velocity v after all of them.

@@ -332,25 +332,32 @@ __device__ inline int place_of_key(unsigned long long key, int probe, int size) 
 }
 #endif
 
-// Reads the surfaces of a node that are known; false if they are not. A search takes a hundred times as long.
+// The place of the surfaces of a node in the table, −1 if they are not known.
 template <class T, int D>
-MPM_HD bool recall([[maybe_unused]] const ContactArguments<T, D>& a, [[maybe_unused]] unsigned long long key,
-                   [[maybe_unused]] MetSurfaces<T, D>& met) {
+MPM_HD int known_place([[maybe_unused]] const ContactArguments<T, D>& a, [[maybe_unused]] unsigned long long key) {
 #ifdef __CUDA_ARCH__
-  if (!a.known_nodes) return false;
+  if (!a.known_nodes) return -1;
   MPM_LOOP for (int probe = 0; probe < kMostProbes; probe++) {
     const int at = place_of_key(key, probe, a.known_size);
-    const unsigned long long found = __ldcg(a.known_nodes + at);
-    if (found == 0) return false;
-    if (found != key) continue;
-    __threadfence();
-    MPM_LOOP for (unsigned k = 0; k < sizeof(met) / sizeof(uint4); k++)
-      reinterpret_cast<uint4*>(&met)[k] =
-          __ldcg(reinterpret_cast<const uint4*>(static_cast<const MetSurfaces<T, D>*>(a.known) + at) + k);
-    return true;
+    unsigned long long found;
+    asm volatile("ld.acquire.gpu.global.u64 %0, [%1];" : "=l"(found) : "l"(a.known_nodes + at) : "memory");
+    if (found == key) return at;
+    if (found == 0) break;
   }
 #endif
-  return false;
+  return -1;
+}
+
+// Reads the surfaces at a place of the table.
+template <class T, int D>
+MPM_HD void recall([[maybe_unused]] const ContactArguments<T, D>& a, [[maybe_unused]] int place,
+                   [[maybe_unused]] MetSurfaces<T, D>& met) {
+#ifdef __CUDA_ARCH__
+  static_assert(sizeof(met) % sizeof(uint4) == 0);
+  const uint4* const stored = reinterpret_cast<const uint4*>(static_cast<const MetSurfaces<T, D>*>(a.known) + place);
+  MPM_LOOP_OF(8)
+  for (unsigned k = 0; k < sizeof(met) / sizeof(uint4); k++) reinterpret_cast<uint4*>(&met)[k] = __ldcg(stored + k);
+#endif
 }
 
 // Whether the obstacles of a scene stay what they are now.
@@ -410,7 +417,9 @@ MPM_HD_CALL void apply_several(bool wanted, const ContactArguments<T, D>& a, int
                                int local, Vector<T, D>& v) {
   MetSurfaces<T, D> met;
   const unsigned long long key = key_of_node(a, scene, corner, local);
-  const bool searches = wanted && !recall(a, key, met);
+  const int place = wanted ? known_place(a, key) : -1;
+  if (place >= 0) recall(a, place, met);
+  const bool searches = wanted && place < 0;
   if (any_of_warp(searches)) {
     ContactSlot<T, D> slot;
     if (searches) slot = contact_slot(a, scene, corner);
@@ -448,17 +457,29 @@ MPM_HD bool meet_several(const SeveralNodes& nodes, int number, bool has_mass, c
   return several;
 }
 
-// The velocity v of a node after contact, if that needs no search for surfaces; `searches` is set if it does.
+// The touch of a node, and the place of its surfaces in the table where it meets several; −1 if they are not known.
 template <class T, int D>
-MPM_HD Vector<T, D> after_known_contact(const ContactArguments<T, D>& a, const NodeTouch<T, D>& touch, int scene,
-                                        const int (&corner)[D], int local, const Vector<T, D>& v, bool& searches) {
-  if (touch.obstacle >= 0) return touch.after(v);
-  if (touch.obstacle != touch.several) return v;
-  MetSurfaces<T, D> met;
-  if (recall(a, key_of_node(a, scene, corner, local), met)) return met.after(v);
-  searches = true;
-  return v;
-}
+struct alignas(16) KnownTouch {
+  NodeTouch<T, D> touch;
+  int place = -1;
+
+  KnownTouch() = default;
+  MPM_HD KnownTouch(const ContactArguments<T, D>& a, int scene, const int (&corner)[D], int local)
+      : touch(lone_touch(a, scene, corner, local)) {
+    if (touch.obstacle == touch.several) place = known_place(a, key_of_node(a, scene, corner, local));
+  }
+  // Whether several surfaces are met that are not known.
+  MPM_HD bool is_sought() const { return touch.obstacle == touch.several && place < 0; }
+  // The velocity v after contact, if that needs no search for surfaces; `searches` is set if it does.
+  MPM_HD Vector<T, D> after(const ContactArguments<T, D>& a, const Vector<T, D>& v, bool& searches) const {
+    searches = is_sought();
+    if (touch.obstacle >= 0) return touch.after(v);
+    if (touch.obstacle != touch.several || searches) return v;
+    MetSurfaces<T, D> met;
+    recall(a, place, met);
+    return met.after(v);
+  }
+};
 
 // ---- passes over the nodes of a slot
 

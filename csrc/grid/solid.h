@@ -533,7 +533,8 @@ class SolidAt {
       MPM_LOOP for (int j = 0; j < foot.count; j++)
         gram[i][j] = again[i][j] = dot(normal[i], normal[j]);
     }
-    if (!solve_definite<T, D>(gram, share, foot.count) || !solve_definite<T, D>(again, ones, foot.count)) return false;
+    if (!solve_definite<0, T, D>(gram, share, foot.count) || !solve_definite<0, T, D>(again, ones, foot.count))
+      return false;
     foot.at = node_, foot.step = zero_vector<T, D>();
     MPM_LOOP for (int i = 0; i < foot.count; i++) {
       if (share[i] < T(0) - (foot.count > 1 ? seam_ / 2 : a_.rounding)) return false;
@@ -595,7 +596,7 @@ class SolidAt {
       MPM_LOOP for (int l = 0; l < foot.count; l++)
         gram[j][l] = dot(normal[j], normal[l]);
     }
-    if (!solve_definite<T, D>(gram, share, foot.count)) return false;
+    if (!solve_definite<0, T, D>(gram, share, foot.count)) return false;
     way = foot.step;
     MPM_LOOP for (int j = 0; j < foot.count; j++)
       way = way + T(-2) * share[j] * normal[j];

@@ -72,9 +72,6 @@ constexpr int64_t kMostLateParticles = 1 << 18;
 
 // Persistent. For a deterministic grid, or a pool of fixed size, half as many particles.
 constexpr int64_t kLeastPersistentSteps = 10, kMostPersistentParticles = 1 << 15, kMostPersistentBlocks = 256;
-// Particles in 3-D with several obstacles. Nodes of more search for obstacles between two barriers, for longer than
-// kernels per step take, where nodes search for them during P2G.
-constexpr int64_t kMostAmongObstacles = 1 << 12;
 // Largest number of particles of an item, with a thread each. It grows with the number of particles, so that one wave
 // of thread blocks suffices for all items.
 template <int D>
@@ -237,8 +234,6 @@ inline std::string unprofitable(const PlanFacts& f) {
   if (f.grows && f.max_blocks != f.blocks()) return "the pool has no room for all blocks of the domain";
   if (!f.grows && f.max_blocks > kMostPersistentBlocks)
     return "the pool has more than " + count(kMostPersistentBlocks, "blocks");
-  if (f.dim == 3 && f.obstacles > 1 && f.particles > kMostAmongObstacles)
-    return "there are more than " + count(kMostAmongObstacles, "particles among several obstacles");
   const int64_t most = kMostPersistentParticles / (f.grows && !f.deterministic ? 1 : 2);
   return f.particles > most ? "there are more than " + count(most, "particles") : "";
 }

@@ -503,7 +503,7 @@ void Substeps<T, D>::make_pool(backend::Stream stream) {
 // The table of surfaces that are found once in the call.
 template <class T, int D>
 void Substeps<T, D>::make_known_nodes(backend::Stream stream) {
-  constexpr int least = 1 << 14, most = 1 << 18, of_scene = 256;
+  constexpr int least = 1 << 14, most = 1 << 18, of_scene = 1 << 10;
   contact.known_size = least;
   while (contact.known_size < most && contact.known_size < of_scene * in.scenes) contact.known_size *= 2;
   known_nodes = empty(in.x, {contact.known_size}, ScalarType::Long);

@@ -72,6 +72,30 @@ __device__ __noinline__ void add_contact(const GridUpdateArguments<T, D>& update
   }
 }
 
+// The touches of the nodes of a thread, by the turn in which it updates a node, where obstacles rest: finding one takes
+// longer than the rest of the update.
+template <class T, int D>
+class KeptTouches {
+ public:
+  __device__ explicit KeptTouches(bool rest) : rest_(rest) {}
+  // Where nodes are numbered anew.
+  __device__ void forget() { has_ = 0; }
+
+  template <class Find>
+  __device__ NodeTouch<T, D> get(int turn, const Find& find) {
+    if (turn < most && (has_ >> turn & 1)) return kept_[turn];
+    const NodeTouch<T, D> found = find();
+    if (rest_ && turn < most) kept_[turn] = found, has_ |= 1u << turn;
+    return found;
+  }
+
+ private:
+  static constexpr int most = 4;
+  const bool rest_;
+  unsigned has_ = 0;  // bits of turns
+  NodeTouch<T, D> kept_[most];
+};
+
 // Spills is false if the whole scene is in shared memory; all loads and stores are then those of shared memory.
 template <class Source, class Task, bool Spills>
 class SceneStep {
@@ -470,7 +494,7 @@ class SceneStep {
   // Returns, to all threads, whether a node meets several surfaces; it has its velocity before contact then, and is
   // added to those of its thread.
   template <bool Obstacles>
-  __device__ bool update_nodes(SeveralNodes& several) const {
+  __device__ bool update_nodes(KeptTouches<T, D>& touches, SeveralNodes& several) const {
 #pragma unroll 1
     for (int i = threadIdx.x, turn = 0; i < state.blocks * count; i += blockDim.x, turn++) {
       const int slot = i / count, local = i % count;
@@ -483,7 +507,8 @@ class SceneStep {
       const SlotUpdate<T, D> there = slot_update(update, slot);
       NodeRow<T, D> row = update_node(update, there, local, node);
       if constexpr (Obstacles) {
-        const NodeTouch<T, D> touch = lone_touch(contact, there.scene, there.corner, local);
+        const auto find = [&] { return lone_touch(contact, there.scene, there.corner, local); };
+        const NodeTouch<T, D> touch = touches.get(turn, find);
         if (touch.obstacle == touch.several) several.add(turn);
         if (touch.obstacle >= 0) row.value = touch.after(row.value);
       }
@@ -567,10 +592,12 @@ template <bool Obstacles, class Step>
 __device__ __forceinline__ int64_t run_scene(Step& s, int64_t step) {
   using T = typename Step::T;
   constexpr int D = Step::D;
+  KeptTouches<T, D> touches(Obstacles && obstacles_rest(s.contact, s.scene));
   s.touch_all();
   __syncthreads();
 #pragma unroll 1
   for (; step < s.a.steps; step++) {
+    if (s.state.grown) touches.forget();
     if (!s.make_room(step)) return step;
     s.load_particles();
     __syncthreads();
@@ -579,7 +606,7 @@ __device__ __forceinline__ int64_t run_scene(Step& s, int64_t step) {
     s.walk();
     auto loaded = s.load_first();
     SeveralNodes several;
-    if (s.template update_nodes<Obstacles>(several)) {
+    if (s.template update_nodes<Obstacles>(touches, several)) {
       add_contact(s.update, s.contact, several, reinterpret_cast<NodeRow<T, D>*>(s.blocks.node),
                   s.state.blocks * Step::count);
       __syncthreads();

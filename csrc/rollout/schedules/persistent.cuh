@@ -125,24 +125,33 @@ struct NodeVelocities {
   const GridUpdateArguments<T, D>& update;
   const ContactArguments<T, D>& contact;
   NodeRows<T, D> nodes;
+  const KnownTouch<T, D>* touches;
 
   // Of a node that meets several surfaces, that before contact; `several` is set. The kernel of one surface has the
-  // contact of those whose surfaces are known. `find_touch()` returns the touch of the node.
-  template <class FindTouch>
-  __device__ Vector<T, D> at(const SlotUpdate<T, D>& there, const TileNode& place, const FindTouch& find_touch,
-                             bool& several) const {
+  // contact of those whose surfaces are known.
+  __device__ Vector<T, D> at(const SlotUpdate<T, D>& there, const TileNode& place, bool& several) const {
+    KnownTouch<T, D> known;
+    if constexpr (C != Contacts::none) known = touch_of(place);
     const NodeRow<T, D> node = row(place);
     if (node.mass == T(0)) return zero_vector<T, D>();
     const Vector<T, D> v = update_node(update, there, place.local, node).value;
     if constexpr (C == Contacts::none) return v;
-    const NodeTouch<T, D> touch = find_touch();
-    if constexpr (C == Contacts::one_surface)
-      return after_known_contact(contact, touch, there.scene, there.corner, place.local, v, several);
-    several = touch.obstacle == touch.several;
-    return touch.obstacle >= 0 ? touch.after(v) : v;
+    if constexpr (C == Contacts::one_surface) return known.after(contact, v, several);
+    several = known.touch.obstacle == known.touch.several;
+    return known.touch.obstacle >= 0 ? known.touch.after(v) : v;
   }
-  __device__ NodeRow<T, D> row(const TileNode& place) const {
-    return nodes.at(int64_t(place.slot) * kBlockNodes<D> + place.local);
+  __device__ NodeRow<T, D> row(const TileNode& place) const { return nodes.at(number(place)); }
+
+ private:
+  __device__ static int64_t number(const TileNode& place) { return int64_t(place.slot) * kBlockNodes<D> + place.local; }
+  // Past the first cache, since another multiprocessor has written it during this kernel.
+  __device__ KnownTouch<T, D> touch_of(const TileNode& place) const {
+    constexpr int vectors = sizeof(KnownTouch<T, D>) / sizeof(uint4);
+    KnownTouch<T, D> known;
+    const uint4* const stored = reinterpret_cast<const uint4*>(touches + number(place));
+#pragma unroll
+    for (int k = 0; k < vectors; k++) reinterpret_cast<uint4*>(&known)[k] = __ldcg(stored + k);
+    return known;
   }
 };
 
@@ -212,9 +221,6 @@ class ItemStep {
     for (int o = 0; o < 1 << D; o++) active_ |= unsigned(m.slots[o] >= 0) << o;
   }
 
-  // Whether the obstacles of the item stay where they are.
-  __device__ void set_rest(bool rests) { rests_ = rests; }
-
   // Loads the inputs of link(), which stay in registers if each particle has a thread.
   __device__ void load() {
     if (!exists_) return;
@@ -264,7 +270,7 @@ class ItemStep {
       __syncthreads();
     }
     const int out_of_block = m.out_of_block;
-    if (C == Contacts::one_surface && out_of_block > out_of_block_at_once) return false;
+    if (C == Contacts::one_surface && !meet_known_surfaces(velocities, tile, out_of_block)) return false;
     int first = 0;
     do {
       const int count = ::min(out_of_block - first, out_of_block_at_once);
@@ -316,9 +322,7 @@ class ItemStep {
       Vector<T, D> v = zero_vector<T, D>();
       bool meets_several = false;
       if (node.slot >= 0) {
-        const SlotUpdate<T, D> there = nodes.update_of(node, update);
-        const auto find_touch = [&] { return touch_of<C>(velocities.contact, there, node, i < of_tile); };
-        v = velocities.at(there, node, find_touch, meets_several);
+        v = velocities.at(nodes.update_of(node, update), node, meets_several);
       }
       if (meets_several) several.add(turn);
       store(v, tile[node.place]);
@@ -330,15 +334,14 @@ class ItemStep {
     return true;
   }
 
-  // The touch of a node. A thread keeps that of its node of the tile where obstacles rest.
+  // Whether the nodes of the particles out of block that G2P reads in later turns have known surfaces alone. By all
+  // threads, before a particle moves.
   template <Contacts C>
-  __device__ NodeTouch<T, D> touch_of(const ContactArguments<T, D>& contact, const SlotUpdate<T, D>& there,
-                                      const TileNode& node, bool of_tile) {
-    static_assert(tile_nodes <= threads);
-    if (C == Contacts::one_surface && of_tile && has_touch_) return touch_;
-    const NodeTouch<T, D> touch = lone_touch(contact, there.scene, there.corner, node.local);
-    if (C == Contacts::one_surface && of_tile && rests_) touch_ = touch, has_touch_ = true;
-    return touch;
+  __device__ bool meet_known_surfaces(const NodeVelocities<C, T, D>& velocities, NodeValue<T, D>* tile,
+                                      int out_of_block) {
+    for (int first = out_of_block_at_once; first < out_of_block; first += out_of_block_at_once)
+      if (!load_velocities(velocities, tile, first, 0, ::min(out_of_block - first, out_of_block_at_once))) return false;
+    return true;
   }
 
   __device__ int corner() const {
@@ -371,8 +374,6 @@ class ItemStep {
   ParticleMomentum<T, D> state_;
   typename Source::Parameters parameters_;
   typename Source::Changes changes_;
-  bool rests_ = false, has_touch_ = false;
-  NodeTouch<T, D> touch_;
 };
 
 // Number of used slots from `begin` to `end`; these come first.
@@ -400,10 +401,35 @@ struct UsedNodes {
         gap((max_blocks - used) * kBlockNodes<D>) {}
   __device__ void empty(T* nodes, const FixedPoint& fixed, int blocks) const {
     NodeRow<T, D>* const rows = reinterpret_cast<NodeRow<T, D>*>(nodes);
+    visit(blocks, [&](int i) { NodeRows<T, D>::empty(rows, i, fixed); });
+  }
+  // Finds what nodes meet, once for all items that read them. Stored twice where obstacles rest, for later substeps.
+  __device__ void find_touches(const GridUpdateArguments<T, D>& update, const ContactArguments<T, D>& contact,
+                               KnownTouch<T, D>* touches, KnownTouch<T, D>* also, int blocks) const {
+    visit(blocks, [&](int i) {
+      const SlotUpdate<T, D> there = slot_update(update, i / kBlockNodes<D>);
+      if (!there.active) return;
+      const KnownTouch<T, D> found(contact, there.scene, there.corner, i % kBlockNodes<D>);
+      touches[i] = found;
+      if (also) also[i] = found;
+    });
+  }
+
+ private:
+  template <class Visit>
+  __device__ void visit(int blocks, const Visit& visit_node) const {
     for (int i = int(blockIdx.x * blockDim.x + threadIdx.x); i < count; i += blocks * int(blockDim.x))
-      NodeRows<T, D>::empty(rows, i < near ? i : i + gap, fixed);
+      visit_node(i < near ? i : i + gap);
   }
 };
+
+// Whether the obstacles of all scenes stay where they are. By all threads of a thread block.
+template <class T, int D>
+__device__ bool all_rest(const ContactArguments<T, D>& contact, int scenes) {
+  bool rest = true;
+  for (int b = threadIdx.x; b < scenes; b += blockDim.x) rest = rest && obstacles_rest(contact, b);
+  return __syncthreads_and(rest);
+}
 
 template <class T, int D>
 __device__ void write_persistent_status(const PersistentLoop<T, D>& a, int scenes, int steps) {
@@ -509,8 +535,10 @@ __global__ void __launch_bounds__(ItemStep<Source, Task>::threads, kItemsOfProce
     contact.row = a.contact.row + step * a.contact.step_stride;
   };
   const auto velocities = [&](int step) {
-    return NodeVelocities<C, T, D>{
-        a.update, contact, {reinterpret_cast<const NodeRow<T, D>*>(a.nodes[step % 3]), source.nodes.fixed}};
+    return NodeVelocities<C, T, D>{a.update,
+                                   contact,
+                                   {reinterpret_cast<const NodeRow<T, D>*>(a.nodes[step % 3]), source.nodes.fixed},
+                                   a.touches[step % 2]};
   };
   const bool has_item = int(blockIdx.x) < items, keeps = alone && has_item;  // an item of its own
   bool more = true;
@@ -528,7 +556,6 @@ __global__ void __launch_bounds__(ItemStep<Source, Task>::threads, kItemsOfProce
   }
   if (keeps && more) {
     item.begin(blockIdx.x);
-    if constexpr (C == Contacts::one_surface) item.set_rest(obstacles_rest(contact, shared.home.scene));
     item.load();
     item.link();
   }
@@ -544,6 +571,7 @@ __global__ void __launch_bounds__(ItemStep<Source, Task>::threads, kItemsOfProce
     for (int64_t i = tail; i < t.particles; i += int64_t(blocks) * threads) skip(t.index[i]);
   };
   const bool ahead = alone && !a.scene_time;
+  bool rest = false;  // whether obstacles stay where they are
   int step = first;
   bool complete = true;
   while (more) {
@@ -553,6 +581,11 @@ __global__ void __launch_bounds__(ItemStep<Source, Task>::threads, kItemsOfProce
       if (!alone) item.load(), item.link(), item.keep();
       if (complete) item.scatter(a.nodes[step % 3]);
     });
+    if (C != Contacts::none && !rest) {
+      __syncthreads();  // after set_contact()
+      rest = step == first && all_rest(contact, t.scenes);
+      used.find_touches(a.update, contact, a.touches[step % 2], rest ? a.touches[(step + 1) % 2] : nullptr, blocks);
+    }
     if (!lasts(barrier.wait())) break;
 
     if (keeps) item.keep();

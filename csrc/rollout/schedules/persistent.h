@@ -1,7 +1,7 @@
 #pragma once
 
+#include "grid/contact.h"
 #include "grid/grid_update.h"
-#include "grid/obstacle.h"
 #include "transfer/advance.h"
 #include "transfer/arguments.h"
 
@@ -61,6 +61,7 @@ struct PersistentLoop {
   int* steps_so_far = nullptr;            // zeroed before a call
   unsigned long long* arrived = nullptr;  // counters of barriers, two words of each kernel, zeroed before each launch
   Handover* handover = nullptr;           // for obstacles
+  KnownTouch<T, D>* touches[2] = {};      // of the nodes, for obstacles; one is found while G2P reads the other
   Displacement* displacement = nullptr;   // requests a new activation
   const int* activated = nullptr;         // status of the activation, [1 + scenes, 8]
   int* status = nullptr;                  // status of all substeps

@@ -24,6 +24,12 @@ bool run_persistent(Substeps<T, D>& s, int* activated, int* status, backend::Str
   a.nodes[0] = static_cast<T*>(s.pool.nodes.data_ptr());
   a.nodes[1] = static_cast<T*>(more.data_ptr());
   a.nodes[2] = static_cast<T*>(torch::stable::narrow(more, 0, rows, rows).data_ptr());
+  Tensor touches;
+  if (s.obstacles) {
+    touches = empty(in.x, {2 * rows * int64_t(sizeof(KnownTouch<T, D>))}, ScalarType::Byte);
+    a.touches[0] = static_cast<KnownTouch<T, D>*>(touches.data_ptr());
+    a.touches[1] = a.touches[0] + rows;
+  }
   a.steps = int(in.n - 2);
   if (s.contact.step_time) a.step_time = s.contact.step_time + 1;
   a.contact.step_time = nullptr;
