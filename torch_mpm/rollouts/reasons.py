@@ -14,9 +14,8 @@ from ..cuda_graphs.capture import (
     CapturedGraphs,
     DeviceConstantCache,
     is_captured,
+    is_eager,
     is_of_library,
-    is_traced,
-    is_transformed,
 )
 from ..errors import shape_of
 from ..grid.grid import Grid
@@ -95,7 +94,7 @@ def _why_not_heated(step: Step, x: Tensor) -> str | None:
 
 def _why_not_eager(x: Tensor) -> str | None:
     """Reason why steps must be launched from Python one by one, where other code observes them."""
-    if is_traced(x) or is_captured(x) or is_transformed():
+    if not is_eager(x):
         return "it is compiled, captured or transformed"
     return "anomaly detection inspects every step" if detecting() else None
 
