@@ -68,6 +68,7 @@ def is_eager(x: Tensor) -> bool:
 
 NUMBERS = (bool, int, float, str, torch.dtype, torch.device)
 """Types that a graph stores by value."""
+_BY_VALUE = frozenset(NUMBERS)
 
 
 def is_of_library(kind: type) -> bool:
@@ -176,7 +177,7 @@ def is_same(known: Any, value: Any) -> bool:
     """Whether a value still equals the part of a key that `as_remembered` made of it."""
     if known is value:  # Neither a tensor nor a list or array.
         return True
-    if isinstance(value, NUMBERS):
+    if type(value) in _BY_VALUE:
         return bool(known == value)
     if isinstance(known, Remembered):
         return known.is_now(value)

@@ -54,14 +54,19 @@ class _Call:
 
     def of(self, state: State, status: Tensor | None) -> _Call:
         """The context of a call from a state, after steps with a status."""
-        fields = _fields(state)
-        continues = bool(self._end) and all([end() is t for end, t in zip(self._end, fields, strict=True)])
-        self.given = None
-        known = continues or state.x.shape[0] > KEPT_PARTICLES
-        if not known and status is not None and is_eager(state.x):
-            trained = any([t is not None and t.requires_grad for t in fields])
-            self.given = state.detach() if trained else state, status
+        self.given, fields = None, _fields(state)
+        if status is None or state.x.shape[0] > KEPT_PARTICLES or self._continues(fields) or not is_eager(state.x):
+            return self
+        trained = any([t is not None and t.requires_grad for t in fields])
+        self.given = state.detach() if trained else state, status
         return self
+
+    def _continues(self, fields: tuple[Tensor | None, ...]) -> bool:
+        """Whether these are the fields of the result of the previous call."""
+        for end, field in zip(self._end, fields, strict=False):
+            if end() is not field:
+                return False
+        return bool(self._end)
 
     def __enter__(self) -> Callable[[State], State]:
         self.goes_on = True
