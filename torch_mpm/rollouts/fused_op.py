@@ -175,7 +175,7 @@ def _substeps(
     )
     errors.follow(errors.status, status)
     grid.watch(status)
-    if status.device.type == "cpu":  # The op has enlarged the pool, or stopped.
+    if status.is_cpu:  # The op has enlarged the pool, or stopped.
         grid.follow(status[0].tolist()[Status.BLOCKS_WANTED if grid.grows else Status.BLOCKS_NOW])
     extra, temperature = _history(state, history_names, history), state.temperature
     if step.heat is not None:

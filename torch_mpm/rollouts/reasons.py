@@ -42,9 +42,10 @@ def why_not_fused(step: Any, state: State, n: int, dt: float | Tensor) -> str | 
     if type(step) is not Step:
         return f"{type(step).__name__} may do more than a Step" if isinstance(step, Step) else "it is no Step"
     x, law, boundaries = state.x, step.law, step.boundaries
-    for name, value in (("dt", dt), ("the time of the state", state.scene_time)):
-        if requires_grad(value) and (step._flip_share or boundaries.reads_time):
-            return f"{name} requires a gradient, with FLIP or boundaries that may read the time"
+    if torch.is_grad_enabled() and (step._flip_share or boundaries.reads_time):
+        for name, value in (("dt", dt), ("the time of the state", state.scene_time)):
+            if requires_grad(value):
+                return f"{name} requires a gradient, with FLIP or boundaries that may read the time"
     if isinstance(dt, Tensor) and dt.dtype != x.dtype:
         return f"dt is a tensor, but not in {str(x.dtype).removeprefix('torch.')}"
     if (reason := _why_not_eager(x)) is not None:
