@@ -37,12 +37,12 @@ int64_t element_size(ScalarType type) {
 Tensor empty_from_cache(const Tensor& like, const Shape& shape, const Shape& strides, ScalarType type) {
   int64_t last = 0;
   for (size_t i = 0; i < shape.size(); i++) {
-    if (shape[i] == 0) return {};
+    if (shape[i] == 0) return absent();
     last += (shape[i] - 1) * strides[i];
   }
   const int64_t bytes = (last + 1) * element_size(type);  // zero for other types
   cpu::Buffer* buffer = bytes < cpu::kLeastCached ? nullptr : cpu::take(bytes);
-  if (!buffer) return {};
+  if (!buffer) return absent();
   return torch::stable::from_blob(buffer->data, shape, strides, like.device(), type,
                                   [buffer](void*) { cpu::give_back(buffer); });
 }

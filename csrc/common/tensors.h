@@ -24,6 +24,12 @@ using torch::stable::Tensor;
 using OptionalTensor = std::optional<Tensor>;
 using Shape = std::vector<int64_t>;
 
+// An undefined tensor. Its copies share one handle; the constructor of Tensor allocates a handle.
+inline const Tensor& absent() {
+  static const Tensor tensor;
+  return tensor;
+}
+
 inline bool has(const OptionalTensor& t) { return t.has_value() && t->defined(); }
 
 // ---- Text for messages
@@ -159,7 +165,7 @@ Tensor empty_particles(const Tensor& like, const Shape& shape);
 
 // Result per particle; undefined, None in Python, where it is not requested.
 inline Tensor result(const Tensor& like, bool wanted, const Shape& shape) {
-  return wanted ? empty_particles(like, shape) : Tensor();
+  return wanted ? empty_particles(like, shape) : absent();
 }
 
 // Sets `scene` and `scene_stride` of the arguments of a kernel: the scene of each particle, [P] of any stride.

@@ -41,7 +41,8 @@ void empty_table(Tensor& table);
 
 // The results of an activation but for its status, and its work space.
 struct ActivationTensors {
-  Tensor table, block, offsets, index, schedule, workspace;
+  Tensor table = absent(), block = absent(), offsets = absent(), index = absent(), schedule = absent();
+  Tensor workspace = absent();
 
   // For the arguments' number of blocks, all but the table by allocate(shape).
   template <class T, int D, class Allocate>

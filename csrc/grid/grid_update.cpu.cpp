@@ -1,4 +1,7 @@
 #include "grid/grid_update.h"
+
+#include <type_traits>
+
 #include "cpu/parallel.h"
 
 namespace mpm::cpu {
@@ -24,15 +27,32 @@ MPM_HD void update_nodes(const GridUpdateArguments<T, D>& a, const SlotUpdate<T,
   for (int local = 0; local < kBlockNodes<D>; local++) to[local] = update_node(a, s, local, from[local]);
 }
 
+// Whether the nodes of a slot have neither mass nor momentum, as most of the slots around a small scene.
+template <class T, int D>
+MPM_HD bool is_empty(const NodeRow<T, D>* nodes) {
+  using Bits = std::conditional_t<sizeof(T) == 4, uint32_t, uint64_t>;
+  const T* const values = reinterpret_cast<const T*>(nodes);
+  Bits any = 0;
+  for (int k = 0; k < kBlockNodes<D> * (1 + D); k++) any |= __builtin_bit_cast(Bits, values[k]);
+  return any == 0;
+}
+
+template <class T, int D>
+MPM_HD void update_slot(const GridUpdateArguments<T, D>& a, int64_t slot) {
+  if (!a.walls.mirrored && is_empty(a.nodes + slot * kBlockNodes<D>)) {  // images may have mass
+    __builtin_memset(static_cast<void*>(a.updated + slot * kBlockNodes<D>), 0, kBlockNodes<D> * sizeof(NodeRow<T, D>));
+    return;
+  }
+  const SlotUpdate<T, D> s = slot_update(a, int(slot));
+  s.active && !s.walled && !s.mirrored ? update_nodes(a, free_of_walls(s), slot) : update_nodes(a, s, slot);
+}
+
 }  // namespace
 
 template <class T, int D>
 void grid_update(const GridUpdateArguments<T, D>& a) {
   parallel_ranges(a.max_blocks, kGrain<D>, [&](int64_t begin, int64_t end) {
-    for (int64_t slot = begin; slot < end; slot++) {
-      const SlotUpdate<T, D> s = slot_update(a, int(slot));
-      s.active && !s.walled && !s.mirrored ? update_nodes(a, free_of_walls(s), slot) : update_nodes(a, s, slot);
-    }
+    for (int64_t slot = begin; slot < end; slot++) update_slot(a, slot);
   });
 }
 

@@ -21,7 +21,7 @@ struct HerschelBulkley : HenckyElasticity {
   MPM_HD static Flow<T> flow(Vector<T, D>& h, const T p[], T[]) {
     const Deviator<T, D> s = measure_deviator(h);
     const T stress = T(1.4142135623730951) * p[0] * s.norm, excess = stress - p[2];
-    const auto plastic = (excess > T(0)) & (stress > T(0)) & (p[0] * p[5] > T(0));
+    const MaskOf<T> plastic = (excess > T(0)) & (stress > T(0)) & (p[0] * p[5] > T(0));
     const auto viscous = plastic & (p[3] > T(0));
     // z = (t − τ_y)/(t_trial − τ_y) solves z + A z^m = 1 with m = 1/n, A = μ Δt (excess/η)^m/excess.
     const T x = select(viscous, excess, T(1)), m = T(1) / p[4];

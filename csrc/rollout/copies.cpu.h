@@ -91,21 +91,14 @@ class Copies {
     if (mixed || (material && (only < 0 || only >= a_.material_count))) {  // some particles may have no law
       for (int k = 0; k < D * D; k++) __builtin_memset(row(R::stress + k), 0, count_ * sizeof(T));
     }
-    ThermalLawsArguments<T, D> thermal;
     for (int k = 0; k < a_.law_count; k++) {
       const ChunkLaw<T, D>& own = a_.laws[k];
-      if (material && !mixed && own.material != only) continue;
-      LawUpdateArguments<T, D> law = here(own);
-      if (mixed) law.law.members = {material, 1, own.material};
-      const bool has_liquid = k + 1 < a_.law_count && a_.laws[k + 1].melts;
-      if (!own.melts) {
-        thermal = thermal_laws(own, has_liquid ? &own + 1 : nullptr, law.law.members);
-        for (int i = 0; i < count_ && thermal.begins(); i++) begin_laws_of(thermal, i);
-      }
-      if (thermal.has_elastic()) use_elastic(own, law);
-      if (own.melts) law.stress = written(a_.liquid_row, D);
-      own.update(law, nullptr);
-      for (int i = 0; i < count_ && thermal.ends() && !has_liquid; i++) end_laws_of(thermal, i);
+      if (own.melts || (material && !mixed && own.material != only)) continue;  // its solid is before it
+      const Members members = mixed ? Members{material, 1, own.material} : Members{};
+      if (a_.temperature_row < 0 && a_.fraction_row < 0)
+        own.update(here(own, members), nullptr);
+      else
+        apply_thermal_laws(own, k + 1 < a_.law_count && a_.laws[k + 1].melts ? &own + 1 : nullptr, members);
     }
   }
 
@@ -177,13 +170,26 @@ class Copies {
 
   Field<T> written(int r, int inner) const { return {row(r), {1, inner * kCopyLine, kCopyLine}}; }
 
+  // Evaluates the first law of a material, and that of its liquid if it melts.
+  void apply_thermal_laws(const ChunkLaw<T, D>& first, const ChunkLaw<T, D>* liquid, const Members& members) const {
+    const ThermalLawsArguments<T, D> a = thermal_laws(first, liquid, members);
+    for (int i = 0; i < count_ && a.begins(); i++) begin_laws_of(a, i);
+    for (const ChunkLaw<T, D>* law : {&first, liquid}) {
+      if (!law) continue;
+      LawUpdateArguments<T, D> u = here(*law, members);
+      if (a.has_elastic()) use_elastic(*law, u);
+      if (law->melts) u.stress = written(a_.liquid_row, D);
+      law->update(u, nullptr);
+    }
+    for (int i = 0; i < count_ && a.ends(); i++) end_laws_of(a, i);
+  }
+
   // The state of a law is F or J without expansion.
   void use_elastic(const ChunkLaw<T, D>& law, LawUpdateArguments<T, D>& u) const {
     u.law.state = law.gradient ? field(a_.elastic_row) : Field<const T>{row(a_.elastic_row + D * D), {1, 0, 0}};
     if (law.plastic) u.state = written(a_.elastic_row, D);
   }
 
-  // Of a material with its first law, and that of its liquid if it melts.
   ThermalLawsArguments<T, D> thermal_laws(const ChunkLaw<T, D>& first, const ChunkLaw<T, D>* liquid,
                                           const Members& members) const {
     ThermalLawsArguments<T, D> a;
@@ -218,11 +224,11 @@ class Copies {
 
   Field<const T> column(int r) const { return r < 0 ? Field<const T>{} : Field<const T>{row(r), {1, 0, 0}}; }
 
-  LawUpdateArguments<T, D> here(const ChunkLaw<T, D>& law) const {
+  LawUpdateArguments<T, D> here(const ChunkLaw<T, D>& law, const Members& members) const {
     LawUpdateArguments<T, D> u = law.arguments;
     LawArguments<T, D>& a = u.law;
     a.particles = count_;
-    a.members = {};
+    a.members = members;
     a.state = law.gradient ? given(R::F) : Field<const T>{given_[R::J], {1, 0, 0}};
     if (law.viscous && a_.has_C) a.C = given(R::C);
     a.scene = numbers_[kSceneRow];

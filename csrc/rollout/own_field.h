@@ -16,7 +16,7 @@ class OwnField {
  public:
   OwnField() = default;
   OwnField(const Tensor& x, const Field<const E>& given, Shape shape) : x_(x), shape_(std::move(shape)), now_(given) {}
-  explicit OwnField(const Tensor& own) : x_(own), now_(field<const E>(own)), buffers_{own, {}}, owned_(true) {
+  explicit OwnField(const Tensor& own) : x_(own), now_(field<const E>(own)), buffers_{own, absent()}, owned_(true) {
     for (int64_t i = 0; i < own.dim(); i++) shape_.push_back(own.size(i));
   }
 
@@ -53,10 +53,10 @@ class OwnField {
  private:
   int other(bool elsewhere) const { return owned_ ? (elsewhere ? 1 - turn_ : turn_) : 0; }
 
-  Tensor x_;
+  Tensor x_ = absent();
   Shape shape_;
   Field<const E> now_;
-  Tensor buffers_[2];
+  Tensor buffers_[2] = {absent(), absent()};
   int turn_ = 0;
   bool owned_ = false;
 };

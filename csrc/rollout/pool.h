@@ -13,7 +13,7 @@ inline int64_t with_headroom(int64_t blocks) { return blocks + blocks / 2 + 16; 
 template <class T, int D>
 struct Pool {
   ActivationTensors active;
-  Tensor nodes, updated, velocity;
+  Tensor nodes = absent(), updated = absent(), velocity = absent();
 
   void make(const Tensor& x, ActivateArguments<T, D>& a, bool obstacles, backend::Stream stream) {
     active.make(x, a, stream);

@@ -36,16 +36,16 @@ struct Substeps {
   ContactArguments<T, D> contact;
   G2PAdvanceArguments<T, D> advance;
   Pool<T, D> pool;
-  Tensor stress, step_time;
-  Tensor scene_time;              // the time of each scene now, where each has its own
-  Tensor displacements;           // counters of two substeps in turn, if activations last
-  Tensor largest_mass;            // of a particle, where sums are fixed
-  NextGridArguments<T, D> next;   // with `update` and `contact` of this struct
-  Tensor known_nodes, known;      // see ContactArguments
-  Tensor impulse, impulse_slots;  // accumulated on obstacles and walls, if wanted; see `add_impulses_to`
+  Tensor stress = absent(), step_time = absent();
+  Tensor scene_time = absent();                         // the time of each scene now, where each has its own
+  Tensor displacements = absent();                      // counters of two substeps in turn, if activations last
+  Tensor largest_mass = absent();                       // of a particle, where sums are fixed
+  NextGridArguments<T, D> next;                         // with `update` and `contact` of this struct
+  Tensor known_nodes = absent(), known = absent();      // see ContactArguments
+  Tensor impulse = absent(), impulse_slots = absent();  // on obstacles and walls, if wanted; see `add_impulses_to`
   bool obstacles = false, fused = false;
   bool laws_are_apart = false;  // whether laws have kernels of their own: they read temperatures, or heat the particles
-  Tensor kept;                  // of FLIP, see `keep_velocities`
+  Tensor kept = absent();       // of FLIP, see `keep_velocities`
   LateDeformation<T, D> late;   // of P2G, if G2P defers F or J to it
   ReorderOnScatter<T, D> reorder;  // of P2G, if the call owns the particles
   bool nodes_are_clear = false;    // when a step begins
@@ -211,7 +211,7 @@ struct Substeps {
   }
 
   void forget_stress() {
-    stress = Tensor();
+    stress = absent();
     for (LawUpdateArguments<T, D>& law : laws) law.stress = {};
   }
 

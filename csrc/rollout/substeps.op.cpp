@@ -1,3 +1,5 @@
+#include <utility>
+
 #include "common/signals.h"
 #include "common/team.h"
 #include "rollout/recorded.h"
@@ -25,7 +27,7 @@ std::optional<Results> run_recorded(const SubstepsInputs& in, backend::Stream st
   const int64_t last = in.n - 1;
   const Tensor status = copy_of(r.status_tensor(last));
   const auto copy = [&](bool wanted, const auto& record, auto view) {
-    if (!wanted) return Tensor();
+    if (!wanted) return absent();
     const Tensor from = (record.*view)(last);
     Tensor to = empty_particles(in.x, sizes_of(from));
     torch::stable::copy_(to, from);
@@ -39,11 +41,11 @@ std::optional<Results> run_recorded(const SubstepsInputs& in, backend::Stream st
                  copy(has(in.J), r.J, &R::scalar),
                  copy(r.steps.columns > 0, r.history, &R::vector),
                  status,
-                 Tensor(),
-                 has(in.scene_time) ? r.scene_time_after() : Tensor(),
+                 absent(),
+                 has(in.scene_time) ? r.scene_time_after() : absent(),
                  copy(has(in.residual), r.residual, &R::vector),
-                 Tensor(),
-                 Tensor(),
+                 absent(),
+                 absent(),
                  r.memory()};
 }
 
@@ -69,9 +71,9 @@ Results no_step(const SubstepsInputs& in, const SortedCpu<T, D>& particles, cons
           impulse,
           time,
           copy(in.residual, has(in.residual), {P, D}),
-          particles.heat ? particles.heat->fields.tensor() : Tensor(),
-          particles.heat ? particles.heat->status : Tensor(),
-          Tensor()};
+          particles.heat ? particles.heat->fields.tensor() : absent(),
+          particles.heat ? particles.heat->status : absent(),
+          absent()};
 }
 
 template <class T, int D>
@@ -81,7 +83,7 @@ Results run_steps(const SubstepsInputs& in, backend::Stream stream) {
   const bool sorts = (schedule_of_latest = schedule_of(in.schedule, s.facts)) == kSortedCpu;
   const Tensor history = packed_history(in.x, in.history, s.columns);
   Tensor status[] = {empty_int(in.x, {1 + in.scenes, kStatusSize}), empty_int(in.x, {1 + in.scenes, kStatusSize})};
-  Tensor impulse, time;
+  Tensor impulse = absent(), time = absent();
   if (has(in.impulse)) s.add_impulses_to(impulse = copy_of(*in.impulse));
   if (has(in.scene_time)) s.count_scene_times(time = copy_of(*in.scene_time));
   if (sorts && SortedCpu<T, D>::may_last(in)) s.make_margin();
@@ -110,9 +112,9 @@ Results run_steps(const SubstepsInputs& in, backend::Stream stream) {
           impulse,
           time,
           particles.residual.tensor(),
-          particles.heat ? particles.heat->fields.tensor() : Tensor(),
-          particles.heat ? particles.heat->status : Tensor(),
-          Tensor()};
+          particles.heat ? particles.heat->fields.tensor() : absent(),
+          particles.heat ? particles.heat->status : absent(),
+          absent()};
 }
 
 #else
@@ -134,14 +136,11 @@ Results run(const SubstepsInputs& in) {
   STD_TORCH_CHECK(in.heat.empty() || (!in.records && in.resident),
                   "heat is computed without gradients: records must be false, and resident true");
   const DeviceScope device(x);
-  if (in.records && !has(in.impulse) && x.size(0) > 0) {
-    std::optional<Results> recorded;
-    dispatch(x, [&]<class T, int D>() { recorded = run_recorded<T, D>(in, device.stream()); });
-    if (recorded) return *recorded;
-  }
-  Results results;
-  dispatch(x, [&]<class T, int D>() { results = run_steps<T, D>(in, device.stream()); });
-  return results;
+  std::optional<Results> results;
+  if (in.records && !has(in.impulse) && x.size(0) > 0)
+    dispatch(x, [&]<class T, int D>() { results = run_recorded<T, D>(in, device.stream()); });
+  if (!results) dispatch(x, [&]<class T, int D>() { results = run_steps<T, D>(in, device.stream()); });
+  return *std::move(results);
 }
 
 Results substeps(MPM_SUBSTEPS_PARAMETERS) { return run(SubstepsInputs{MPM_SUBSTEPS_ARGUMENTS}); }

@@ -18,7 +18,7 @@ NAMES = [name for name, law in LAWS.items() if isinstance(law(), CompiledLaw)]
 
 def parameters(law):
     """Attributes of a law that hold its parameters."""
-    return [name for name, value in law._stored() if law._range(name) is not None]
+    return [name for name in law._stored() if law._range(name) is not None]
 
 
 def stress(law, **changes):

@@ -59,8 +59,16 @@ def is_transformed() -> bool:
     return torch._C._are_functorch_transforms_active() or torch.autograd.forward_ad._current_level >= 0
 
 
+def is_eager(x: Tensor) -> bool:
+    """Whether operations on a tensor run at once: neither compiled, exported, captured nor transformed."""
+    if torch.compiler.is_compiling() or is_exported() or is_transformed():
+        return False
+    return not (isinstance(x, torch._subclasses.FakeTensor) or is_captured(x))
+
+
 NUMBERS = (bool, int, float, str, torch.dtype, torch.device)
 """Types that a graph stores by value."""
+_BY_VALUE = frozenset(NUMBERS)
 
 
 def is_of_library(kind: type) -> bool:
@@ -169,6 +177,8 @@ def is_same(known: Any, value: Any) -> bool:
     """Whether a value still equals the part of a key that `as_remembered` made of it."""
     if known is value:  # Neither a tensor nor a list or array.
         return True
+    if type(value) in _BY_VALUE:
+        return bool(known == value)
     if isinstance(known, Remembered):
         return known.is_now(value)
     if isinstance(value, (tuple, list)):

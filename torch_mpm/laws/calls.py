@@ -17,18 +17,17 @@ from .thermal_calls import COHERENCY, is_thermal, phases_of, tables_of_expansion
 class LawCalls(NamedTuple):
     """Arguments of ops that call laws."""
 
-    names: str
-    """Names of the compiled laws: commas between materials, a plus before a contribution to the stress of a
-    material.
-    """
+    names: list[str]
+    """Names of the compiled laws of each material, with a plus before a contribution to the stress."""
     options: list[int]
-    """Number of parameters of each law; likewise the number of its history tensors."""
+    """Options of each law."""
     variables: list[int]
+    """Number of history tensors of each law."""
     parameters: list[Tensor]
     """Parameters of all laws, one after another; likewise the history."""
     history: list[Tensor]
     history_names: list[list[str]]
-    """Options of each material."""
+    """Names of the history of each material."""
     material: Tensor | None
     """Material of each particle; None for a single one."""
     thermal: list[int]
@@ -59,51 +58,52 @@ def law_calls(law: Material, state: Any, dt: float | Tensor | None = None, heate
     """
     laws = laws_of(law)
     material = law.check_material(state) if isinstance(law, Mixture) else None
-    names: list[str] = []
-    each: list[tuple[int, list[Tensor], list[Tensor]]] = []  # Per law: options, parameters, history.
-    history_names: list[list[str]] = []
-    thermal: list[int] = []
-    tables: list[Tensor] = []
+    calls = LawCalls([], [], [], [], [], [], material if len(laws) > 1 else None, [], [])
+    for part in laws:
+        if heated and is_thermal(part):
+            _add_phases(calls, part, state, dt)
+            continue
+        own: CompiledLaw = passive(part)  # type: ignore[assignment]
+        name = _add(calls, own, state, dt)
+        calls.history_names.append(own.history_names())
+        if isinstance(part, Active):
+            name += f"+{FIBRE}"
+            calls.options.append(0)
+            calls.variables.append(0)
+            calls.parameters.extend(part.fibre_parameters(state))
+        calls.names.append(name)
+    return calls
 
-    def add(own: CompiledLaw) -> str:
-        with_dt: Any = state if dt is None or not own.rate_dependent else Overlay(state, dt=dt)
-        each.append((own.option_bits(), own._arguments(with_dt)[1], own._history(state)))
-        return own._name(state)
+
+def _add(calls: LawCalls, law: CompiledLaw, state: Any, dt: float | Tensor | None) -> str:
+    """Add a law to calls; returns its name."""
+    with_dt: Any = state if dt is None or not law.rate_dependent else Overlay(state, dt=dt)
+    calls.options.append(law.option_bits())
+    calls.parameters.extend(law._arguments(with_dt)[1])
+    history = law._history(state)
+    calls.variables.append(len(history))
+    calls.history.extend(history)
+    return law._name(state)
+
+
+def _add_phases(calls: LawCalls, law: Material, state: Any, dt: float | Tensor | None) -> None:
+    """Add the laws of a material that reads the temperature, and their tables."""
+    phases = phases_of(law)
+    solid: CompiledLaw = phases.solid  # type: ignore[assignment]
+    liquid: CompiledLaw | None = phases.liquid  # type: ignore[assignment]
 
     def add_tables(found: list[tuple[int, Tensor]] | None) -> None:
         assert found is not None
         for what, table in found:
-            thermal.extend((len(each) - 1, what, len(tables)))
-            tables.append(table.to(state.x).contiguous())
+            calls.thermal.extend((len(calls.options) - 1, what, len(calls.tables)))
+            calls.tables.append(table.to(state.x).contiguous())
 
-    for part in laws:
-        if not heated or not is_thermal(part):
-            own: CompiledLaw = passive(part)  # type: ignore[assignment]
-            names.append(add(own))
-            history_names.append(own.history_names())
-            if isinstance(part, Active):
-                names[-1] += f"+{FIBRE}"
-                each.append((0, part.fibre_parameters(state), []))
-            continue
-        phases = phases_of(part)
-        solid: CompiledLaw = phases.solid  # type: ignore[assignment]
-        liquid: CompiledLaw | None = phases.liquid  # type: ignore[assignment]
-        names.append(add(solid))
-        add_tables(tables_of_parameters(solid, state.x))
-        add_tables(tables_of_expansion(phases.expansion))
-        history_names.append(solid.history_names())
-        if liquid is not None:
-            names[-1] += f"~{add(liquid)}"
-            add_tables(tables_of_parameters(liquid, state.x))
-            add_tables([(COHERENCY, state.x.new_tensor([[0.0], [phases.coherency]]))])
-    return LawCalls(
-        ",".join(names),
-        [options for options, _, _ in each],
-        [len(history) for _, _, history in each],
-        [parameter for _, parameters, _ in each for parameter in parameters],
-        [variable for _, _, history in each for variable in history],
-        history_names,
-        material if len(laws) > 1 else None,
-        thermal,
-        tables,
-    )
+    name = _add(calls, solid, state, dt)
+    add_tables(tables_of_parameters(solid, state.x))
+    add_tables(tables_of_expansion(phases.expansion))
+    calls.history_names.append(solid.history_names())
+    if liquid is not None:
+        name += f"~{_add(calls, liquid, state, dt)}"
+        add_tables(tables_of_parameters(liquid, state.x))
+        add_tables([(COHERENCY, state.x.new_tensor([[0.0], [phases.coherency]]))])
+    calls.names.append(name)

@@ -89,7 +89,7 @@ class CompiledLaw(Material):
         for part in places:
             del part[name]
         self._store(name, value)
-        functions = [name for name, v in self._stored() if callable(v) and not isinstance(v, Tensor)]
+        functions = [name for name, v in self._stored().items() if callable(v) and not isinstance(v, Tensor)]
         self._functions = any([self._range(name) is not None for name in functions])
 
     @staticmethod
@@ -318,14 +318,14 @@ class CompiledLaw(Material):
                 if isinstance(value, (Tensor, PerMaterial)):
                     check_length(ARGUMENTS.get(name, name), value, particles, scenes)
 
-    def _stored(self) -> list[tuple[str, Any]]:
+    def _stored(self) -> dict[str, Any]:
         """Attributes that may be parameters, by the names under which they are stored; in compiled code only registered
         ones, since compilers of torch 2.11 do not support the others.
         """
-        registered = [*self._parameters.items(), *self._buffers.items(), *self._modules.items()]
+        registered = {**self._parameters, **self._buffers, **self._modules}
         if torch.compiler.is_compiling():
             return registered
-        return registered + [item for item in vars(self).items() if type(item[1]) not in _NO_VALUES]
+        return registered | {name: v for name, v in vars(self).items() if type(v) not in _NO_VALUES}
 
     def _parameters_of(self, state: State) -> list[Tensor]:
         """Parameters in the dtype, on the device and in the particle order of the state.
@@ -335,12 +335,8 @@ class CompiledLaw(Material):
         if self._functions:
             in_order: Any = Overlay(state, ids=None)  # Evaluated parameters have this form already.
             return self._at_temperature(state)._convert(in_order)
-        tensors, numbers = [], []
-        for _, value in self._stored():
-            if isinstance(value, Tensor):
-                tensors.append(value)
-            elif isinstance(value, (float, int, Real)):
-                numbers.append(value)
+        stored = self._stored().values()
+        tensors = [value for value in stored if isinstance(value, Tensor)]
         x, order = state.x, None
         particles = getattr(state, "particles", x.shape[0])
         if not all([needs_no_scenes(t, particles) for t in tensors]):
@@ -349,6 +345,7 @@ class CompiledLaw(Material):
             return self._convert(state)
         if any([t.numel() == particles for t in tensors]):
             order = state.ids  # Only parameters that differ by particle.
+        numbers = [value for value in stored if isinstance(value, (float, int, Real))]
         key = (x.dtype, x.device, order, *numbers, *tensors)
         return self._kept_parameters.get(key, lambda: self._convert(state), x)
 
@@ -356,7 +353,7 @@ class CompiledLaw(Material):
         """The law with its parameters at the temperature of each particle, in the order of the state."""
         law: CompiledLaw = object.__new__(type(self))
         law.__dict__ = {**self.__dict__, "_parameters": {}, "_buffers": {}, "_modules": {}}
-        for name, value in self._stored():
+        for name, value in self._stored().items():
             if isinstance(value, Tensor) or (callable(value) and not name.startswith("_")):
                 law.__dict__[name] = evaluate(ARGUMENTS.get(name, name), value, state)
         return law

@@ -17,6 +17,9 @@ EXPANSION, COHERENCY = -1, -2
 """What a table gives, in the place of the number of a parameter."""
 
 
+THERMAL = (ThermalExpansion, Melting)
+
+
 class Phases(NamedTuple):
     """The parts of a material that is one or two compiled laws, with or without thermal expansion."""
 
@@ -40,14 +43,15 @@ def phases_of(law: Material) -> Phases:
 
 def laws_in(law: Material) -> list[Material]:
     """The laws of the phases."""
+    if type(law) not in THERMAL:
+        return [law]
     phases = phases_of(law)
     return [phases.solid] if phases.liquid is None else [phases.solid, phases.liquid]
 
 
 def is_thermal(law: Material) -> bool:
     """Whether a law expands, melts, or has parameters that are functions of the temperature."""
-    has_functions = any([isinstance(part, CompiledLaw) and part.has_functions for part in laws_in(law)])
-    return type(law) in (ThermalExpansion, Melting) or has_functions
+    return type(law) in THERMAL or (isinstance(law, CompiledLaw) and law.has_functions)
 
 
 Tables = list[tuple[int, Tensor]]
@@ -71,7 +75,7 @@ def tables_of_parameters(law: CompiledLaw, x: Tensor) -> Tables | None:
     one is not piecewise linear, or others differ between particles or scenes. Cached while nothing has changed."""
     if not law.has_functions:
         return []
-    given = [value for name, value in law._stored() if law._range(name) is not None]
+    given = [value for name, value in law._stored().items() if law._range(name) is not None]
     functions = [value for value in given if callable(value) and not isinstance(value, Tensor)]
     others = [value for value in given if isinstance(value, Tensor)]
     if any([type(f) is not Table for f in functions]) or any([value.numel() > 1 for value in others]):

@@ -18,7 +18,10 @@ _LIBRARY = torch.library.Library("torch_mpm", "IMPL")
 
 def dispatch(op: Any, *arguments: Any) -> Any:
     """`op(*arguments)`, without the kernel of `register_autograd` where nothing requires grad or has a tangent."""
-    return op(*arguments) if _is_differentiated(*arguments) else _below_autograd(op, arguments)
+    if _is_differentiated(*arguments):
+        return op(*arguments)
+    with torch._C._AutoDispatchBelowAutograd():
+        return op(*arguments)
 
 
 def is_tracked(*tensors: torch.Tensor) -> bool:

@@ -135,9 +135,9 @@ def obstacle_arguments(
 
     With times the parameters are those at each of these, and some may follow a path.
     """
-    table: tuple[Tensor | None, Tensor | None] = (None, None)
-    if group:
-        table = tables(group, like, scenes) if times is None else tables_over(group, like, scenes, times)
+    if not group:
+        return None, None, [], [], [], [], [], []
+    table = tables(group, like, scenes) if times is None else tables_over(group, like, scenes, times)
     forms = [o.shape for o in group]
     return (
         *table,

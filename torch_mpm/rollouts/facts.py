@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any, NamedTuple
 
 import torch
@@ -62,19 +63,22 @@ class Facts(NamedTuple):
 
 def facts_of(steps: Steps, state: State, stores_all: bool = False) -> Facts:
     """Facts of steps in the fused op."""
-    step, n, dt = steps.step, steps.n, steps.dt
+    step, x = steps.step, state.x
     assert isinstance(step, Step)
-    x, grid = state.x, step.grid
-    law = step.law
-    laws, moved = laws_of(law), law.state_fields
     gradients = wants_gradient(steps, state)
+    records = gradients and stores_all and state.impulse is None and len(state) > 0
+    path_bytes = _path_bytes(step, steps, state) if step.boundaries.entries else 0
+    if not x.is_cuda:
+        return _facts_on_cpu(steps.n, gradients, records, path_bytes)
+    grid, law = step.grid, step.law
+    laws, moved = laws_of(law), law.state_fields
     return Facts(
-        x.is_cuda,
+        True,
         x.dtype == torch.float32,
         grid.dim,
         len(state),
         grid.scenes,
-        n,
+        steps.n,
         grid.block_count // max(grid.scenes, 1),
         -1 if grid.max_blocks is None else grid.max_blocks,
         grid.grows,
@@ -85,22 +89,29 @@ def facts_of(steps: Steps, state: State, stores_all: bool = False) -> Facts:
         step.stress_form == "mls",
         has_mirrors(step),
         state.impulse is not None,
-        isinstance(dt, Tensor) or state.scene_time is not None,
+        isinstance(steps.dt, Tensor) or state.scene_time is not None,
         state.scene is not None,
         state.ids is not None,
         sum([2 if isinstance(part, Active) else len(laws_in(part)) for part in laws]),
         len(laws) > 1,
         False,
-        not x.is_cuda or _is_uniform(laws[0]),
+        _is_uniform(laws[0]),
         (state.F is not None or "F" in moved) != (state.J is not None or "J" in moved),
         gradients,
-        gradients and stores_all and state.impulse is None and len(state) > 0,
+        records,
         is_captured(x),
-        x.is_cuda and graph_loops(),
-        _path_bytes(step, steps, state) if step.boundaries.entries else 0,
+        graph_loops(),
+        path_bytes,
         len(step.boundaries.entries),
         step.heat is not None,
     )
+
+
+@functools.lru_cache(maxsize=1024)
+def _facts_on_cpu(steps: int, gradients: bool, records: bool, path_bytes: int) -> Facts:
+    """Facts of steps on the CPU, whose schedules depend on no others."""
+    none = Facts(*[False] * len(Facts._fields))
+    return none._replace(steps=steps, gradients=gradients, records=records, path_bytes=path_bytes)
 
 
 def _is_uniform(law: Any) -> bool:

@@ -149,7 +149,7 @@ def _arguments(
         *(state.x, state.v, state.mass, state.volume, state.C, state.F, state.J),
         None if state.x_residual is None else state.x_residual.detach(),
         *(calls.history, state.scene, state.ids, calls.material, step._error_status.status_for(state.x)),
-        *(calls.names, calls.options, calls.parameters, calls.variables),
+        *(",".join(calls.names), calls.options, calls.parameters, calls.variables),
         *(int(n), number, apic, step._flip_share, wants_C, STRESS_FORMS[step.stress_form]),
         _gravity(step, state.x),
         *wall_arguments(step.walls, grid),
@@ -175,21 +175,21 @@ def _substeps(
     )
     errors.follow(errors.status, status)
     grid.watch(status)
-    if status.device.type == "cpu":  # The op has enlarged the pool, or stopped.
+    if status.is_cpu:  # The op has enlarged the pool, or stopped.
         grid.follow(status[0].tolist()[Status.BLOCKS_WANTED if grid.grows else Status.BLOCKS_NOW])
     extra, temperature = _history(state, history_names, history), state.temperature
     if step.heat is not None:
         temperature, of_heat = heat_changes(step.heat, state, heat, heat_status)
         extra |= of_heat
         C = C if step._keeps_C else None
-    now = time_after(state.time, dt, n) if time is None else _in_shape(time.detach(), state.time, dt)
-    if requires_grad(dt) or requires_grad(state.time):
-        known: Any = state.time + n * (dt.double() if isinstance(dt, Tensor) else dt)
+    before = state.time
+    now = time_after(before, dt, n) if time is None else _in_shape(time.detach(), before, dt)
+    if requires_grad(dt) or requires_grad(before):
+        known: Any = before + n * (dt.double() if isinstance(dt, Tensor) else dt)
         now = now + (known - known.detach())  # Adds the gradient, and not a value.
     residual = None if residual is None else residual.detach()
-    return state.replace(
-        x=x, v=v, C=C, F=F, J=J, temperature=temperature, extra=extra, time=now, impulse=impulse, x_residual=residual
-    )
+    moved = {"x": x, "v": v, "C": C, "F": F, "J": J, "temperature": temperature, "x_residual": residual}
+    return state.with_results(moved | {"extra": extra, "time": now, "impulse": impulse})
 
 
 def _in_shape(times: Tensor, time: float | Tensor, dt: float | Tensor) -> Tensor:

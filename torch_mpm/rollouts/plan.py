@@ -96,8 +96,10 @@ class RolloutPlan:
         """The plan of a call with n steps left, from a pool of `max_blocks`."""
         facts, blocks = self.facts, -1 if max_blocks is None else max_blocks
         assert facts is not None
-        if facts.steps != n or facts.max_blocks != blocks:
-            facts = facts._replace(steps=n, max_blocks=blocks)
+        if facts.steps != n:
+            facts = facts._replace(steps=n)
+        if facts.cuda and facts.max_blocks != blocks:
+            facts = facts._replace(max_blocks=blocks)
         return plan_call(self.schedule if self.forced else None, facts)
 
     def of_sorted(self) -> RolloutPlan:

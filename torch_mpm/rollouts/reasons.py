@@ -14,9 +14,8 @@ from ..cuda_graphs.capture import (
     CapturedGraphs,
     DeviceConstantCache,
     is_captured,
+    is_eager,
     is_of_library,
-    is_traced,
-    is_transformed,
 )
 from ..errors import shape_of
 from ..grid.grid import Grid
@@ -43,9 +42,10 @@ def why_not_fused(step: Any, state: State, n: int, dt: float | Tensor) -> str | 
     if type(step) is not Step:
         return f"{type(step).__name__} may do more than a Step" if isinstance(step, Step) else "it is no Step"
     x, law, boundaries = state.x, step.law, step.boundaries
-    for name, value in (("dt", dt), ("the time of the state", state.scene_time)):
-        if requires_grad(value) and (step._flip_share or boundaries.reads_time):
-            return f"{name} requires a gradient, with FLIP or boundaries that may read the time"
+    if torch.is_grad_enabled() and (step._flip_share or boundaries.reads_time):
+        for name, value in (("dt", dt), ("the time of the state", state.scene_time)):
+            if requires_grad(value):
+                return f"{name} requires a gradient, with FLIP or boundaries that may read the time"
     if isinstance(dt, Tensor) and dt.dtype != x.dtype:
         return f"dt is a tensor, but not in {str(x.dtype).removeprefix('torch.')}"
     if (reason := _why_not_eager(x)) is not None:
@@ -95,7 +95,7 @@ def _why_not_heated(step: Step, x: Tensor) -> str | None:
 
 def _why_not_eager(x: Tensor) -> str | None:
     """Reason why steps must be launched from Python one by one, where other code observes them."""
-    if is_traced(x) or is_captured(x) or is_transformed():
+    if not is_eager(x):
         return "it is compiled, captured or transformed"
     return "anomaly detection inspects every step" if detecting() else None
 

@@ -132,16 +132,15 @@ class State:
         Raises:
             TypeError, ValueError: for another shape, dtype or device.
         """
-        x = self.x
+        x, fields = self.x, self.__dict__
         P, D = x.shape
-        shapes = {"[P]": (P,), "[P, D]": (P, D), "[P, D, D]": (P, D, D)}
         for name in names:
-            value = self.__dict__.get(name)
+            value = fields.get(name)
             if value is None and name not in _NEEDED:
                 continue
             if name in _SYMBOLS:
                 symbols = _SYMBOLS[name]
-                check_like(name, value, x, shapes[symbols], symbols, name in _NEEDED)
+                check_like(name, value, x, (P, D, D)[: symbols.count(",") + 1], symbols, name in _NEEDED)
             elif name in _INDICES:
                 check_index(name, value, x, _INDICES[name])
             elif name == "impulse":
@@ -251,12 +250,17 @@ class State:
         x = changes.get("x", self.x)
         if torch.compiler.is_compiling() or not changes.keys() <= _NAMES or not _is_alike(x, self.x):
             return self._rebuilt(changes)
+        state = self.with_results(changes)
+        state._check(changes)
+        return state
+
+    def with_results(self, changes: dict[str, Any]) -> State:
+        """A copy with fields that an op computed from this state, which are not checked."""
         state: State = object.__new__(State)
         state.__dict__.update(self.__dict__)
         if "time" in changes:
             state.time = changes.pop("time")
         state.__dict__.update(changes)
-        state._check(changes)
         return state
 
     def _rebuilt(self, changes: dict[str, Any]) -> State:

@@ -180,7 +180,7 @@ def law_diagnostics(law: Material, state: State, with_energy: bool) -> LawDiagno
     """Stress, stiffness and, with `with_energy`, energy density of a law."""
     if all(isinstance(part, CompiledLaw) and part.figures_are_compiled() for part in laws_of(law)):
         calls = law_calls(law, state)
-        how = calls.names, calls.options, calls.parameters, calls.history, calls.variables
+        how = ",".join(calls.names), calls.options, calls.parameters, calls.history, calls.variables
         return LawDiagnostics(*law_figures(state, *how, calls.material, with_energy))
     energy = law.energy_density(state) if with_energy else None
     return LawDiagnostics(law.stress(state), law.stiffness(state), energy)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import operator
 import weakref
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
@@ -14,10 +13,9 @@ from torch import Tensor
 
 from ..cuda_graphs.capture import (
     is_captured,
+    is_eager,
     is_exported,
     is_of_library,
-    is_traced,
-    is_transformed,
     outside_transforms,
     remember,
     without_transforms,
@@ -52,18 +50,23 @@ class _Call:
     def __init__(self) -> None:
         self.goes_on = False
         self.given: tuple[State, Tensor] | None = None
-        self._end: tuple[weakref.ref[Tensor] | None, ...] = ()
+        self._end: list[Callable[[], Tensor | None]] = []
 
     def of(self, state: State, status: Tensor | None) -> _Call:
         """The context of a call from a state, after steps with a status."""
-        end = [None if t is None else t() for t in self._end]
-        continues = bool(end) and all(map(operator.is_, _fields(state), end))
-        self.given = None
-        known = continues or state.x.shape[0] > KEPT_PARTICLES
-        if not (known or status is None or is_traced(state.x) or is_captured(state.x) or is_transformed()):
-            trained = any(t is not None and t.requires_grad for t in _fields(state))
-            self.given = state.detach() if trained else state, status
+        self.given, fields = None, _fields(state)
+        if status is None or state.x.shape[0] > KEPT_PARTICLES or self._continues(fields) or not is_eager(state.x):
+            return self
+        trained = any([t is not None and t.requires_grad for t in fields])
+        self.given = state.detach() if trained else state, status
         return self
+
+    def _continues(self, fields: tuple[Tensor | None, ...]) -> bool:
+        """Whether these are the fields of the result of the previous call."""
+        for end, field in zip(self._end, fields, strict=False):
+            if end() is not field:
+                return False
+        return bool(self._end)
 
     def __enter__(self) -> Callable[[State], State]:
         self.goes_on = True
@@ -73,8 +76,12 @@ class _Call:
         self.goes_on = False
 
     def _ended(self, result: State) -> State:
-        self._end = tuple(None if t is None else weakref.ref(t) for t in _fields(result))
+        self._end = [_absent if t is None else weakref.ref(t) for t in _fields(result)]
         return result
+
+
+def _absent() -> None:
+    """In place of a weak reference to a field that is None."""
 
 
 def _fields(state: State) -> tuple[Tensor | None, ...]:
@@ -131,7 +138,7 @@ class ErrorStatus:
 
     def begin(self, state: State, scenes: int) -> None:
         """Check the first state, before a step from it."""
-        if self.status is None and not (is_traced(state.x) or is_captured(state.x) or is_transformed()):
+        if self.status is None and is_eager(state.x):
             with torch.no_grad():  # A decorator would be stored by an export.
                 self.given = problems_of_first_state(state, scenes)
 

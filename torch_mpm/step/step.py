@@ -16,7 +16,7 @@ from ..boundaries.apply import after_boundaries, project
 from ..boundaries.control import control_step, motions_now
 from ..boundaries.impulses import Impulses, check_impulse, impulses_of, no_impulse
 from ..boundaries.thickness import warn_of_thin_walls
-from ..cuda_graphs.capture import DeviceConstantCache, is_captured, is_traced, is_transformed
+from ..cuda_graphs.capture import DeviceConstantCache, is_eager
 from ..errors import REAL, PrecisionWarning, check_flag, check_number, is_finite, shape_of
 from ..geometry.per_scene import WRITABLE
 from ..geometry.values import Value, constant, filled, shape_of_value
@@ -310,7 +310,7 @@ class Step(TensorModule):
             return self._read_dt
         if not dt.is_floating_point():
             return math.inf  # The step refuses it.
-        if dt.is_meta or is_traced(dt) or is_captured(dt) or is_transformed():
+        if dt.is_meta or not is_eager(dt):
             return math.inf
         values = dt.detach()
         least = float(torch.where(values > 0, values, math.inf).amin()) if values.numel() else math.inf

@@ -99,7 +99,7 @@ class SortedCpu {
   std::vector<ParticleRow<int>> numbers_;
   std::vector<const T*> prefetched_;
   LawsP2GArguments<T, D> a_;
-  Tensor copies_;
+  Tensor copies_ = absent();
   int copied_rows_ = 0;
   bool reads_F_ = false, reads_J_ = false, viscous_ = false, rearranged_ = false;
   bool owned_ = false, moved_ = true;  // whether the fields are in buffers; whether some have moved since the last step
