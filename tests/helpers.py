@@ -27,6 +27,8 @@ TOLERANCE = {
     "rollout": {torch.float32: 1e-4, torch.float64: 1e-11},  # where the order of sums differs
     "rollout with FLIP": {torch.float32: 1e-4, torch.float64: 1e-10},  # differences of two transfers
     "rollout gradient": {torch.float32: 1e-5, torch.float64: 1e-11},
+    # Relative changes of positions change gradients by parameters of laws up to 500 times as much (Cam-Clay).
+    "rollout gradient on CUDA": {torch.float32: 1e-4, torch.float64: 1e-10},
 }
 """Relative errors of results that only rounding changes."""
 

@@ -57,7 +57,7 @@ def assert_same(
             assert value is None or float(value.norm()) == 0, name
             continue
         assert value is not None and bool(value.isfinite().all()), name
-        kind = tolerance or ("rollout" if value.is_cuda else "rollout gradient")
+        kind = tolerance or ("rollout gradient on CUDA" if value.is_cuda else "rollout gradient")
         error = float((value - reference).norm() / reference.norm())
         assert error < TOLERANCE[kind][value.dtype], f"{name}: {error} {text}"
 
