@@ -68,9 +68,9 @@ struct ContactArguments {
   int64_t stride = 0, grad_stride = 0, mass_stride = 0;
   T* result =
       nullptr;  // rows [max_blocks * 4^D, 1 + D] as of the grid update, the first column zero or a mass' adjoint
-  // Of many substeps on CUDA: hash table of the surfaces that nodes meet where the obstacles rest, see `recall`.
+  // Of many substeps: the surfaces that nodes meet where the obstacles rest, on CUDA in a hash table, see `recall`.
   unsigned long long* known_nodes = nullptr;  // keys [known_size], zero on entry
-  void* known = nullptr;                      // MetSurfaces [known_size]
+  void* known = nullptr;                      // MetSurfaces [known_size]; on the CPU a std::shared_ptr<void>
   int known_size = 0;                         // a power of two
   T* row_grad = nullptr;  // adjoint of the rows by each slot [max_blocks, obstacles, width], or null; backward only
 };

@@ -1,6 +1,7 @@
 #pragma once
 
 #include <cmath>
+#include <memory>
 #include <string>
 #include <type_traits>
 
@@ -42,6 +43,7 @@ struct Substeps {
   Tensor largest_mass = absent();                       // of a particle, where sums are fixed
   NextGridArguments<T, D> next;                         // with `update` and `contact` of this struct
   Tensor known_nodes = absent(), known = absent();      // see ContactArguments
+  std::shared_ptr<void> known_slots;                    // on the CPU, see contact.cpu.cpp
   Tensor impulse = absent(), impulse_slots = absent();  // on obstacles and walls, if wanted; see `add_impulses_to`
   bool obstacles = false, fused = false;
   bool laws_are_apart = false;  // whether laws have kernels of their own: they read temperatures, or heat the particles
@@ -489,7 +491,7 @@ template <class T, int D>
 void Substeps<T, D>::make_pool(backend::Stream stream) {
   const bool apart = obstacles && !next.obstacles;  // contact is separate from the grid update
   pool.make(in.x, activation, apart, stream);
-  if (MPM_BACKEND == MPM_BACKEND_IS_cuda && obstacles && in.resident && in.n > 1) make_known_nodes(stream);
+  if (obstacles && in.resident && in.n > 1) make_known_nodes(stream);
   if (largest_mass.defined()) pool.nodes = empty(in.x, Pool<T, D>::nodes_shape(activation), ScalarType::Long);
   if (impulse.defined() && (MPM_BACKEND == MPM_BACKEND_IS_cpu || in.lattice.deterministic()))
     impulse_slots = empty(in.x, {activation.slots(), impulse_shape()[1] * kImpulse<D>}, ScalarType::Double);
@@ -500,9 +502,13 @@ void Substeps<T, D>::make_pool(backend::Stream stream) {
   }
 }
 
-// The table of surfaces that are found once in the call.
+// What is found once in the call: on CUDA a table of surfaces, on the CPU the surfaces by slot.
 template <class T, int D>
 void Substeps<T, D>::make_known_nodes(backend::Stream stream) {
+  if (MPM_BACKEND == MPM_BACKEND_IS_cpu) {
+    contact.known = &known_slots;
+    return;
+  }
   constexpr int least = 1 << 14, most = 1 << 18, of_scene = 1 << 10;
   contact.known_size = least;
   while (contact.known_size < most && contact.known_size < of_scene * in.scenes) contact.known_size *= 2;
