@@ -62,6 +62,8 @@ def bodies(dim: int, path, **options) -> list[mpm.boundaries.Obstacle]:
 @pytest.mark.parametrize(("n", "dtype"), [(1, F64), (2, torch.float32), (5, F64), (17, torch.float32)])
 @pytest.mark.parametrize("transfer", SOME_TRANSFERS)
 def test_paths(path, n, transfer, dtype, dim, device):
+    if n == 17 and path != "smooth" and transfer != "apic":
+        pytest.skip("fewer steps have it")
     state = blob(device, dim, dtype=dtype)
     obstacles = bodies(dim, PATHS[path](dim, device))
     step = mpm.Step(unit_box(dim), mpm.NeoHookean(E=1e4, nu=0.3), boundaries=obstacles, **TRANSFERS[transfer]).to(
@@ -77,7 +79,7 @@ def test_paths(path, n, transfer, dtype, dim, device):
 
 
 @pytest.mark.parametrize("scenes", [1, 3])
-@pytest.mark.parametrize("n", [6, 40])
+@pytest.mark.parametrize("n", [6, 17])
 def test_paths_of_scenes_with_clocks_of_their_own(scenes, n, dim, device):
     state = blob(device, dim, scene=torch.arange(300, dtype=torch.int32) % scenes)
     state = state.replace(scene=state.scene.int(), time=1e-4 * torch.arange(scenes, dtype=F64, device=device))
@@ -101,7 +103,8 @@ def assert_equal_clocks(a: mpm.State, b: mpm.State) -> None:
 def test_paths_in_small_scenes(clocks, deterministic, dim, device):
     """On CUDA a thread block has each scene for all substeps, or one kernel many substeps of a scene; with parameters
     that each scene has, and clocks."""
-    for scenes, count in ((1, 2000), (40, 4000)):
+    sizes, n = (((1, 2000), (40, 4000)), 30) if device == "cuda" else (((1, 300), (5, 500)), 8)
+    for scenes, count in sizes:
         scene = (torch.arange(count, device=device) % scenes).int()
         state = blob(device, dim, count, torch.float32).replace(scene=scene)
         grid = unit_box(dim, scenes=scenes, deterministic=deterministic)
@@ -113,7 +116,7 @@ def test_paths_in_small_scenes(clocks, deterministic, dim, device):
             state = state.replace(time=2e-4 * torch.arange(scenes, device=device))
             dt = DT * (1 + torch.arange(scenes, device=device) / 100)
         assert step.explain(state, dt).startswith("all steps in one op")
-        ends = [run(step, state, 30, dt).replace(time=0.0) for run in (mpm.rollout, one_by_one)]
+        ends = [run(step, state, n, dt).replace(time=0.0) for run in (mpm.rollout, one_by_one)]
         assert_equal(*ends, f"{scenes} scenes")
 
 
@@ -182,9 +185,9 @@ def test_many_obstacles(count, dim, device):
         mpm.Step(unit_box(dim), mpm.NeoHookean(E=1e4, nu=0.3), boundaries=pegs(f)) for f in (mpm.Sphere, Plain)
     )
     assert in_one_op(step, state) == (count <= MAX_OBSTACLES) and not in_one_op(plain, state)
-    expected = one_by_one(plain, state, 6, DT)
-    assert_equal(mpm.rollout(step, state, 6, DT), expected)
-    assert_equal(one_by_one(step, state, 6, DT), expected)
+    expected = one_by_one(plain, state, 3, DT)
+    assert_equal(mpm.rollout(step, state, 3, DT), expected)
+    assert_equal(one_by_one(step, state, 3, DT), expected)
 
 
 @torch.no_grad()
@@ -243,7 +246,7 @@ def test_clocks_of_float32_are_those_of_single_steps(device):
     ball = mpm.Box(lambda t: torch.stack([0.3 + 20 * (t - 8), 0.5 + 0 * t], -1), (0.2, 0.3), angular_velocity=3.0)
     step = mpm.Step(unit_box(2), mpm.NeoHookean(E=1e3, nu=0.3), boundaries=[ball])
     dt = torch.full((1,), 1e-5, device=device)
-    end, expected = mpm.rollout(step, state, 400, dt), one_by_one(step, state, 400, dt)
+    end, expected = mpm.rollout(step, state, 200, dt), one_by_one(step, state, 200, dt)
     assert torch.equal(end.time, expected.time)
     assert float((end.v - expected.v).abs().max()) < 1e-3 * float(expected.v.abs().max())
 

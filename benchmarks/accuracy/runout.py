@@ -452,7 +452,7 @@ def measure(device: str, quick: bool, only: str) -> dict[str, Any]:
     cases, slopes, variants, aspects, angles = CASES, SLOPES, VARIANTS, ASPECTS, ANGLES
     duration, standing_duration = 6.0, 4.0
     if quick:
-        cases = tuple(dataclasses.replace(c, cells=150) for c in (PLANAR[0], SLABS[0], ROUND[0]))
+        cases = tuple(dataclasses.replace(c, cells=60) for c in (PLANAR[0], SLABS[0], ROUND[0]))
         slopes = tuple(dataclasses.replace(c, cells=10) for c in SLOPES[:2])
         variants, aspects, angles = (), (1.0, 2.0), (20, 50)
         duration = standing_duration = 1.0

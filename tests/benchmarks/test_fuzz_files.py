@@ -12,7 +12,7 @@ from benchmarks import common
 for package in ("h5py", "isal", "matplotlib", "meshio", "pydantic", "trimesh"):
     pytest.importorskip(package)
 
-SHORT = {"lines": 10, "inputs": 8, "configurations": 6, "shards": 6, "records": 8, "memory": 3}
+SHORT = {"lines": 6, "inputs": 5, "configurations": 4, "shards": 4, "records": 5, "memory": 2}
 LONG = {"lines": 600, "inputs": 200, "configurations": 400, "shards": 100, "records": 1000, "memory": 500}
 
 

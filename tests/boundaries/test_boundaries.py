@@ -431,11 +431,15 @@ def test_capture_in_a_graph(dim, device):
     torch.testing.assert_close(captured, all_bodies(), rtol=0, atol=0)
 
 
-def test_compile(dim):
+FACES = pytest.param(2, "faces", marks=pytest.mark.slow)  # which take up to half a minute to compile
+
+
+@pytest.mark.parametrize(("dim", "form"), [(2, "pose"), (3, "path"), FACES])
+def test_compile(dim, form):
     positions, velocity = cloud(dim)
     time = torch.tensor(0.3, dtype=torch.float64)
-    plane, sphere, box, *_, on_path = moving_shapes(dim)  # those with faces and outlines take up to a minute
-    bodies = [plane, sphere, box if dim == 2 else on_path]
+    plane, sphere, box, *_, on_path = moving_shapes(dim)  # those with outlines take up to a minute
+    bodies = {"pose": [plane, sphere], "path": [sphere, on_path], "faces": [box]}[form]
 
     def all_bodies(velocity: Tensor, positions: Tensor, time: Tensor) -> Tensor:
         for body in bodies:

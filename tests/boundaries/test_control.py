@@ -219,7 +219,7 @@ PATHS = {
 @pytest.mark.parametrize("run", ["rollout", "steps", "torch operations"])
 @pytest.mark.parametrize("path", PATHS)
 def test_paths_without_a_derivative_are_differenced(path, run, device):
-    n = 60
+    n = 35
     form = (lambda p: p) if path != "tensor of numbers" else (lambda p: lambda t: p(t).to(t.device))
     position = form(PATHS[path])
     paddle = box(position) if run != "torch operations" else mpm.SDF(shapes.Box((0.1, 0.6)).signed_distance, position)
@@ -287,11 +287,11 @@ def test_paths_of_one_time_serve_scenes_with_times_of_their_own(path, scenes, ru
         step = step_with(paddle, scenes=scenes)
         state = mpm.State.concatenate([block(device=device)] * scenes, scene=True)
         if run == "to":
-            return mpm.rollout_to(step, state, 60 * dt, longest=1e-3).state
+            return mpm.rollout_to(step, state, 40 * dt, longest=1e-3).state
         if run == "rollout":
-            return mpm.rollout(step, state, 120, dt)
+            return mpm.rollout(step, state, 60, dt)
         state = state.replace(time=torch.zeros(scenes, dtype=F64, device=device))
-        for _ in range(80):
+        for _ in range(40):
             state = step(state, dt)
         return state
 

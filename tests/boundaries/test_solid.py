@@ -147,7 +147,7 @@ KINDS_AND_PLACES = [("separate", 0.0), ("separate", 0.4 * DX), ("slip", 0.4 * DX
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize(("kind", "at"), KINDS_AND_PLACES)
 def test_nodes_behind_a_corner_meet_all_its_faces(device, dim, form, kind, at):
-    if dim == 3 and kind == "slip":
+    if dim == 3 and (kind == "slip" or (kind == "sticky" and form not in ("floor under walls", "own shape"))):
         pytest.skip("2-D has it")
     blocks, velocity = nodes(dim, device, at)
     tested, expected = expected_in_tank(blocks, velocity, kind)
@@ -276,8 +276,8 @@ def resting_on(obstacles: list[Obstacle], walls: str | None, steps: int) -> mpm.
 
 def seams(form: str) -> list[Obstacle]:
     if form == "sdf of a union":  # two boxes that touch between nodes, and at one
-        parts = [shapes.Box((b - a, 0.4)) for a, b in ((-0.3, 0.6), (0.6, 0.73), (0.73, 1.9))]
-        middles = [torch.tensor([0.5 * (a + b), -0.2]) for a, b in ((-0.3, 0.6), (0.6, 0.73), (0.73, 1.9))]
+        parts = [shapes.Box((b - a, 0.4)) for a, b in ((-0.3, 0.45), (0.45, 0.58), (0.58, 1.9))]
+        middles = [torch.tensor([0.5 * (a + b), -0.2]) for a, b in ((-0.3, 0.45), (0.45, 0.58), (0.58, 1.9))]
 
         def distance(x: Tensor) -> Tensor:
             each = [part.signed_distance(x - at.to(x)) for part, at in zip(parts, middles, strict=True)]
@@ -292,7 +292,7 @@ def seams(form: str) -> list[Obstacle]:
 @pytest.mark.filterwarnings("ignore::torch_mpm.ThinWallWarning")
 @pytest.mark.parametrize("form", ["touching", "overlapping", "sdf of a union"])
 def test_a_block_slides_over_seams(form):
-    steps = 110 if form == "sdf of a union" else 150
+    steps = 72 if form == "sdf of a union" else 150
     state = resting_on(seams(form), None, steps)
     assert float(state.x[:, 0].mean()) == pytest.approx(0.3 + 2.0 * steps * 2e-3, rel=1e-2)
     assert float(state.v[:, 0].mean()) == pytest.approx(2.0, rel=1e-2)
@@ -303,9 +303,10 @@ def test_a_block_slides_over_seams(form):
 @pytest.mark.parametrize("walls", ["slip", "separate", "mirror"])
 def test_a_box_as_wide_as_the_domain_has_no_end_faces(device, dim, reach, walls):
     """It ends at the walls, beyond them or just before; nodes beyond the walls meet its upper face alone."""
-    grid = mpm.Grid(DX, (0.0,) * dim, (1.0,) * dim)
+    end = (0.6, 0.6, 0.5)[:dim]
+    grid = mpm.Grid(DX, (0.0,) * dim, end)
     blocks, lower = random_blocks(grid, device), [-reach * DX] * dim
-    upper = [1.0 + reach * DX] * dim
+    upper = [e + reach * DX for e in end]
     lower[1], upper[1] = 0.1, 0.5
     floor, velocity = box(lower, upper), torch.randn(blocks.node_count, dim, dtype=torch.float64).to(device)
     x = blocks.node_positions(torch.float64)
@@ -316,7 +317,7 @@ def test_a_box_as_wide_as_the_domain_has_no_end_faces(device, dim, reach, walls)
     faces = mpm.Walls(sides)
     for axis in range(dim):  # what the grid update leaves of the velocity there
         if axis != 1:
-            beyond = (x[:, axis] <= 1e-9) | (x[:, axis] >= 1 - 1e-9)
+            beyond = (x[:, axis] <= 1e-9) | (x[:, axis] >= end[axis] - 1e-9)
             velocity[:, axis] = torch.where(beyond, 0, velocity[:, axis])
             expected[:, axis] = torch.where(beyond, 0, expected[:, axis])
     for after in (contact(blocks, velocity, [floor], 0.0, faces), in_torch(blocks, velocity, [floor], faces)):
@@ -495,7 +496,7 @@ def test_the_kernel_is_what_torch_operations_are(device, dim, dtype, walls):
         pytest.skip("2-D has it")
     grid = mpm.Grid(1 / 12 if dim == 2 else 1 / 7, (0.0,) * dim, (1.0,) * dim)
     differs = met = 0
-    for seed in range(12 if dim == 2 else 2 if walls is None else 1):
+    for seed in range(8 if dim == 2 else 2 if walls is None else 1):
         random = torch.Generator().manual_seed(seed + (0 if walls is None else len(walls)))
         obstacles = any_obstacles(1 + seed % 4 if dim == 2 else 3, dim, random)
         blocks = random_blocks(grid, device)

@@ -409,7 +409,7 @@ def test_a_scene_that_needs_too_many_steps_fails_alone(tmp_path):
 
 
 def test_a_scene_without_room_is_recorded(tmp_path):
-    made = configuration(body__0__count={"choice": [1, 30], "weights": [1, 8]})
+    made = configuration(body__0__count={"choice": [1, 30], "weights": [1, 8]}, dataset__splits={"train": 3})
     generate(made, tmp_path, device="cpu")
     attempted = DatasetFolder(tmp_path).attempted()
     assert {s.valid for s in attempted} == {True, False}

@@ -25,6 +25,8 @@ def alone(h, **options):
 
 @pytest.mark.parametrize("deterministic", [False, True])
 def test_batch_is_the_reference(device, dim, kernel, deterministic):
+    if dim == 3 and (kernel == "cubic") == deterministic:
+        pytest.skip("2-D has it")
     h = batch(dim, kernel, device, deterministic=deterministic)
     for options in ({"tolerance": 0.0, "max_iterations": 2}, {"tolerance": 1e-9, "max_iterations": 200}):
         got, expected = h.solve(**options), alone(h, **options)
