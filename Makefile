@@ -1,15 +1,15 @@
-# Targets: build, test, check, format, demo, examples, wheel, bench, study, sanitize, gpu, clean (see CONTRIBUTING.md).
+# Targets: build, test, thorough, check, format, demo, examples, wheel, bench, study, sanitize, gpu, clean (see CONTRIBUTING.md).
 # PYTHON creates the virtual environment; version TORCH of torch is installed there unless torch is present.
 PYTHON ?= python3
 TORCH ?= 2.13.0
 VENV ?= .venv
 PY := $(VENV)/bin/python
 STAMP := $(VENV)/.torch_mpm
-QUICK := -q -m "not slow"
+QUICK := -q -m "not slow and not thorough"
 
 SOURCES := $(shell find csrc -name '*.h' -o -name '*.cuh' -o -name '*.cpp' -o -name '*.cu')
 
-.PHONY: build libraries test check format demo examples wheel bench study sanitize gpu clean
+.PHONY: build libraries test thorough check format demo examples wheel bench study sanitize gpu clean
 
 build: $(STAMP)
 	$(PY) setup.py -q build_ext --inplace
@@ -37,6 +37,9 @@ THREADED := tests/test_rollouts.py tests/test_topology.py tests/ops/test_transfe
 test: build
 	OMP_NUM_THREADS=1 $(PY) -m pytest $(QUICK) -n auto --dist worksteal
 	$(PY) -m pytest $(QUICK) $(THREADED)
+
+thorough: build
+	OMP_NUM_THREADS=1 $(PY) -m pytest -q -m thorough -n auto --dist worksteal
 
 check: $(STAMP)
 	$(PY) -m ruff check .

@@ -34,6 +34,19 @@ def pytest_configure() -> None:
             signal.signal(number, handler)
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Cases of a test with `thorough(name=value)` that have this value become `thorough`; others lose the mark."""
+    for item in items:
+        for mark in list(item.iter_markers("thorough")):
+            if mark.kwargs and not mark.kwargs.items() <= _parameters(item).items():
+                item.own_markers.remove(mark)
+
+
+def _parameters(item: pytest.Item) -> dict[str, object]:
+    return item.callspec.params if hasattr(item, "callspec") else {}
+
+
 def pytest_runtest_setup(item: pytest.Item) -> None:
     if item.get_closest_marker("cuda") and not CUDA:
         pytest.skip("needs a CUDA device")

@@ -26,17 +26,20 @@ def session_with_a_hidden_gpu(directory: Path, **environment: str) -> subprocess
     return session(**{"TORCH_MPM_CUDA": "", "CUDA_VISIBLE_DEVICES": "", "PATH": path, **environment})
 
 
+@pytest.mark.thorough
 def test_a_gpu_that_cannot_be_tested_is_an_error(tmp_path: Path) -> None:
     done = session_with_a_hidden_gpu(tmp_path)
     assert done.returncode == pytest.ExitCode.USAGE_ERROR
     assert "this machine has a GPU, but " in done.stderr
 
 
+@pytest.mark.thorough
 def test_a_gpu_may_be_left_out_by_name(tmp_path: Path) -> None:
     done = session_with_a_hidden_gpu(tmp_path, TORCH_MPM_CUDA="0")
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.thorough
 def test_a_library_without_the_sanitizers_asked_for_is_an_error() -> None:
     done = session(TORCH_MPM_SANITIZE="thread", TORCH_MPM_CUDA="0")
     assert done.returncode == pytest.ExitCode.USAGE_ERROR

@@ -56,6 +56,7 @@ def assert_balanced(step: mpm.Step, state: mpm.State, end: mpm.State, angular: b
         assert float((left / exchanged).max()) < tolerance, "angular" if part else "linear"
 
 
+@pytest.mark.thorough(dim=3)
 @pytest.mark.parametrize("walls", WALLS)
 @pytest.mark.parametrize(("dim", "transfer"), [*((2, name) for name in TRANSFERS), (3, "apic"), (3, "blend")])
 def test_momentum_is_balanced(device, dim, walls, transfer):

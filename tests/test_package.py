@@ -69,6 +69,7 @@ def of_avx(name: str) -> bool:
     return any(level in name for level in AVX_NAMES)
 
 
+@pytest.mark.thorough
 def test_only_code_of_the_avx_levels_uses_avx(functions: list[tuple[str, list[str]]]) -> None:
     """An inline function merged across levels must be the one that every x86-64 processor can run."""
     avx = {name for name, lines in functions if any("%ymm" in line or "%zmm" in line for line in lines)}

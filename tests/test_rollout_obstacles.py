@@ -97,6 +97,7 @@ def assert_equal_clocks(a: mpm.State, b: mpm.State) -> None:
     assert_equal(a.replace(time=0.0), b.replace(time=0.0))
 
 
+@pytest.mark.thorough(dim=3)
 @torch.no_grad()
 @pytest.mark.parametrize("deterministic", [False, True])
 @pytest.mark.parametrize("clocks", [False, True])
@@ -169,6 +170,7 @@ class Plain(mpm.Sphere):
         self.shape.__class__ = type("Own", (type(self.shape),), {})
 
 
+@pytest.mark.thorough(dim=3)
 @torch.no_grad()
 @pytest.mark.parametrize("count", [17, MAX_OBSTACLES, MAX_OBSTACLES + 1])
 def test_many_obstacles(count, dim, device):

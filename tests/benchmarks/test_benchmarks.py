@@ -16,6 +16,7 @@ from benchmarks.speed import checkpoints, peers, step, work
 from benchmarks.stability.stable_dt import LAWS
 
 
+@pytest.mark.thorough
 def test_speed_program_times_every_part(tmp_path: Path) -> None:
     run_quick("benchmarks.speed.step", tmp_path, "--peers")
     found = result(tmp_path, "speed_*.json")
@@ -132,6 +133,7 @@ def test_limits_program(tmp_path: Path) -> None:
     assert all(row["polar"] < 1e-6 for row in errors.values())
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("program", ["convergence", "precision", "ritter", "rollout_gradients"])
 def test_accuracy_program(program: str, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
@@ -185,6 +187,7 @@ def test_captions_of_the_documents_have_a_sentence_per_line() -> None:
             assert line[-1] in ".:", f"{document.name}: {line}"
 
 
+@pytest.mark.thorough
 def test_return_map_of_sand_against_extended_precision(tmp_path: Path) -> None:
     for package in ("matplotlib", "mpmath", "torch_mpm._math"):
         pytest.importorskip(package)
@@ -208,6 +211,7 @@ def test_gradients_of_sand_program(tmp_path: Path) -> None:
             assert max(case["largest"], case["of the usual norm, largest"]) < found["allowed"]
 
 
+@pytest.mark.thorough
 def test_no_law_is_unstable_below_its_estimate(tmp_path: Path) -> None:
     run_quick("benchmarks.stability.law_dt", tmp_path)
     cases = result(tmp_path, "stability_laws.json")["cases"]
@@ -222,6 +226,7 @@ def test_random_rollouts_program(tmp_path: Path) -> None:
     assert not any(row["inverted"] or row["flattened"] or row["not finite"] for row in found["rows"])
 
 
+@pytest.mark.thorough
 def test_data_sets_program(tmp_path: Path) -> None:
     run_quick("benchmarks.datasets", tmp_path, "--only", "Water", "--work", str(tmp_path))
     alone, together = result(tmp_path, "datasets_*.json")["sets"]

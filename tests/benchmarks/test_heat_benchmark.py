@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import pytest
 import torch
 from helpers import random_particles, result, run_quick
 from oracle.heat import HeatOperator
@@ -19,6 +20,7 @@ def test_gradients_of_the_heat_matrix(dim: int, kernel: str) -> None:
     torch.testing.assert_close(gradient, expected.gradient, rtol=1e-12, atol=1e-13)
 
 
+@pytest.mark.thorough
 def test_heat_benchmark(tmp_path: Path) -> None:
     run_quick("benchmarks.accuracy.heat", tmp_path)
     found = result(tmp_path, "heat.json")

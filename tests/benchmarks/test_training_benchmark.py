@@ -75,6 +75,7 @@ def test_a_way_that_fails_is_reported() -> None:
     assert "no_such_backend" in network_steps.text(rows) and len(list(network_steps.timed(rows))) == 1
 
 
+@pytest.mark.thorough
 def test_training_program(tmp_path: Path) -> None:
     run_quick("benchmarks.speed.training", tmp_path)
     found = result(tmp_path, "training_*.json")

@@ -282,6 +282,7 @@ def test_only_in_its_scene(dim, device):
 # ---- gradients
 
 
+@pytest.mark.thorough(dim=3)
 @pytest.mark.parametrize("shape", ["plane", "sphere", "capsule", "sdf", "box"])
 @pytest.mark.parametrize("kind", ["sticky", "separate"])
 def test_gradcheck(dim, shape, kind):
@@ -395,6 +396,7 @@ def moving_shapes(dim: int, **options: object) -> list[Obstacle]:
     return [*bodies, mpm.Sphere(lambda t: torch.stack([t.sin()] * dim, -1), 0.6, **turning, **options)]
 
 
+@pytest.mark.thorough(dim=3)
 def test_nothing_synchronises(dim, monkeypatch):
     monkeypatch.setattr(constraints, "reads_values", lambda x: False)  # as on a GPU
     monkeypatch.setattr(motion, "is_readable", lambda x: False)
@@ -434,6 +436,7 @@ def test_capture_in_a_graph(dim, device):
 FACES = pytest.param(2, "faces", marks=pytest.mark.slow)  # which take up to half a minute to compile
 
 
+@pytest.mark.thorough(dim=3)
 @pytest.mark.parametrize(("dim", "form"), [(2, "pose"), (3, "path"), FACES])
 def test_compile(dim, form):
     positions, velocity = cloud(dim)

@@ -259,6 +259,7 @@ def test_gradients(device, dim, kind):
     torch.testing.assert_close(grad, expected, rtol=0, atol=1e-12)
 
 
+@pytest.mark.thorough(dim=3)
 @pytest.mark.parametrize("shape", NAMES)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("scenes", [1, 3])
@@ -296,6 +297,7 @@ def test_friction_of_zero_has_a_gradient(device, kind):
     assert float(grad) == pytest.approx(-3.0, rel=1e-14)  # the tangential velocity is 2 - 3 friction
 
 
+@pytest.mark.thorough(dim=3)
 @pytest.mark.parametrize("shape", NAMES)
 def test_gradcheck(dim, shape):
     grid = mpm.Grid(0.25, (0.0,) * dim, (0.5,) * dim)

@@ -270,6 +270,7 @@ ONE_TIME = {
 }
 
 
+@pytest.mark.thorough(scenes=3)
 @pytest.mark.parametrize(
     ("run", "scenes"), [("rollout", 2), ("rollout", 3), ("steps", 1), ("steps", 2), ("to", 3), ("torch operations", 2)]
 )

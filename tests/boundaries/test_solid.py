@@ -144,6 +144,7 @@ def expected_in_tank(blocks: mpm.Blocks, velocity: Tensor, kind: str) -> tuple[T
 KINDS_AND_PLACES = [("separate", 0.0), ("separate", 0.4 * DX), ("slip", 0.4 * DX), ("sticky", 0.4 * DX)]
 
 
+@pytest.mark.thorough(dim=3)
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize(("kind", "at"), KINDS_AND_PLACES)
 def test_nodes_behind_a_corner_meet_all_its_faces(device, dim, form, kind, at):
@@ -299,6 +300,7 @@ def test_a_block_slides_over_seams(form):
     assert float(state.x[:, 1].min()) > -0.01
 
 
+@pytest.mark.thorough(dim=3)
 @pytest.mark.parametrize("reach", [0.0, 0.3, 3.0, -0.05])
 @pytest.mark.parametrize("walls", ["slip", "separate", "mirror"])
 def test_a_box_as_wide_as_the_domain_has_no_end_faces(device, dim, reach, walls):
@@ -401,6 +403,7 @@ def motion_of(dim: int, device: str) -> dict[str, Tensor]:
     return {name: torch.tensor(v, dtype=torch.float64, device=device).requires_grad_() for name, v in values.items()}
 
 
+@pytest.mark.thorough(dim=3)
 @pytest.mark.parametrize("form", ["box and sphere", "box and capsule", "two spheres", "cup"])
 @pytest.mark.parametrize("fused", [True, False])
 def test_gradients_by_the_pose_of_curved_faces_are_those_of_differences(device, dim, form, fused):

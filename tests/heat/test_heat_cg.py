@@ -88,6 +88,7 @@ def test_particles_elsewhere_than_activated_conduct_nothing_on_cuda(device, dim)
 # ---- the solve
 
 
+@pytest.mark.thorough(dim=3)
 @pytest.mark.parametrize("method", ["cg", "chebyshev", "multigrid"])
 @pytest.mark.parametrize("boundaries", [False, True])
 def test_solve_is_the_dense_one(device, dim, kernel, boundaries, method, far):
@@ -114,6 +115,7 @@ def test_solve_is_the_reference_iteration_by_iteration(device, dim, kernel, dete
         torch.testing.assert_close(got.residual, expected[2], rtol=1e-9, atol=1e-14)
 
 
+@pytest.mark.thorough(dim=3)
 def test_float32(device, dim, kernel, far):
     h = heat(dim, kernel, device, torch.float32, sizes=(300, 200), far=far)
     solve = h.solve(tolerance=1e-7)

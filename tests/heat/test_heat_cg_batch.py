@@ -23,6 +23,7 @@ def alone(h, **options):
     )
 
 
+@pytest.mark.thorough(dim=3)
 @pytest.mark.parametrize("deterministic", [False, True])
 def test_batch_is_the_reference(device, dim, kernel, deterministic):
     if dim == 3 and (kernel == "cubic") == deterministic:

@@ -44,6 +44,7 @@ def stand_off(kernel, dx, shift, dim=2, gap=0.0):
     return (end.temperature - distance - gap) / dx, distance
 
 
+@pytest.mark.thorough(dim=3)
 @pytest.mark.parametrize("dim,shift", [(2, 0.0), (2, 0.12), (2, 0.37), (2, 0.75), (3, 0.6)])
 def test_stand_off_of_held_surface(kernel, dim, shift):
     """The temperature is the distance from the wall wherever it lies between the nodes, beside it as in the middle."""

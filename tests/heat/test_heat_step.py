@@ -38,6 +38,7 @@ def test_no_jump_makes_a_step_grow(case, transfer):
     assert float((A - A.T).abs().max()) < 1e-12
 
 
+@pytest.mark.thorough
 def test_table_of_the_benchmark():
     """Its quick form has every variant, and its tables have the results of the cases."""
     chosen = list(heat_step.cases(quick=True))

@@ -59,6 +59,7 @@ def test_short_steps_give_what_explicit_ones_do(kind, floor, dim, device):
         assert float((explicit - implicit)[:, surface].norm()) < 1e-4 * float(explicit.norm())
 
 
+@pytest.mark.thorough(dim=3)
 @pytest.mark.parametrize(("friction", "dim"), [(0.2, 2), (1.0, 2), (0.2, 3)])
 def test_gradients_of_the_impulses(friction, dim, device):
     """By all that a step depends on, and by where the obstacle is and how it moves."""

@@ -26,6 +26,7 @@ def weighed(device, dim):
     return grid, values, lambda s: sum((w * t).sum() for w, t in zip(weights, (s.x, s.v, s.F), strict=True))
 
 
+@pytest.mark.thorough(dim=3)
 @pytest.mark.parametrize(("kind", "friction"), KINDS)
 @pytest.mark.parametrize("shape", SHAPES)
 def test_gradients_by_motion_and_shape(shape, kind, friction, dim, device):

@@ -243,6 +243,7 @@ def test_first_and_second_derivatives(law: str, shape: str, dim: int, device: st
     assert torch.autograd.gradgradcheck(energy, inputs[: count + 1])
 
 
+@pytest.mark.thorough(dim=3)
 @pytest.mark.parametrize("law", LAWS)
 def test_opcheck(law: str, dim: int, device: str) -> None:
     state, parameters, C, scene = arguments(law, dim, count=5, shape="scene")

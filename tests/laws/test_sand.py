@@ -575,6 +575,7 @@ def gradient_states(dim: int) -> Tensor:
     return h if dim == 3 else h[:, 1:]
 
 
+@pytest.mark.thorough(dim=3)
 @pytest.mark.parametrize(("energy", "apex", "flow"), FORMS)
 def test_gradients(device, dim, energy, apex, flow):
     """Derivatives of every result by every argument."""

@@ -126,6 +126,7 @@ def test_columns_of_a_batch_are_what_they_are_alone(device, dim):
         assert torch.allclose(together.F[mine], alone.F, rtol=0, atol=1e-9)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("program", ["accuracy.runout", "stability.collapse"])
 def test_sand_programs(program, tmp_path):
     pytest.importorskip("matplotlib")

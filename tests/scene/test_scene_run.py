@@ -338,6 +338,7 @@ def wait_for_frames(folder, frames, process):
             pass
 
 
+@pytest.mark.thorough
 def test_sigkill_in_the_middle_loses_and_repeats_nothing(tmp_path):
     path = tmp_path / "scene.toml"
     path.write_text(FILE.format(duration=0.8))
