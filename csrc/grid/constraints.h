@@ -71,8 +71,8 @@ MPM_HD bool solve_normals(const Constraints<S, D>& c, unsigned set, S (&b)[Const
     members += has_i;
     if (!has_i) b[i] = S(0);
     MPM_LOOP_OF(N)
-    for (int j = 0; j < count; j++) gram[i][j] =
-        has_i && (set >> j & 1) ? dot(c.e[i].normal, c.e[j].normal) : S(i == j ? 1 : 0);
+    for (int j = 0; j < count; j++)
+      gram[i][j] = has_i && (set >> j & 1) ? dot(c.e[i].normal, c.e[j].normal) : S(i == j ? 1 : 0);
   }
   return members <= D && solve_definite<N, S, most>(gram, b, count);
 }
