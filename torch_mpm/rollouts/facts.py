@@ -69,7 +69,7 @@ def facts_of(steps: Steps, state: State, stores_all: bool = False) -> Facts:
     records = gradients and stores_all and state.impulse is None and len(state) > 0
     path_bytes = _path_bytes(step, steps, state) if step.boundaries.entries else 0
     if not x.is_cuda:
-        return _facts_on_cpu(steps.n, gradients, records, path_bytes)
+        return _facts_on_cpu(len(state), steps.n, state.ids is not None, gradients, records, path_bytes)
     grid, law = step.grid, step.law
     laws, moved = laws_of(law), law.state_fields
     return Facts(
@@ -108,10 +108,13 @@ def facts_of(steps: Steps, state: State, stores_all: bool = False) -> Facts:
 
 
 @functools.lru_cache(maxsize=1024)
-def _facts_on_cpu(steps: int, gradients: bool, records: bool, path_bytes: int) -> Facts:
-    """Facts of steps on the CPU, whose schedules depend on no others."""
+def _facts_on_cpu(
+    particles: int, steps: int, is_sorted: bool, gradients: bool, records: bool, path_bytes: int
+) -> Facts:
+    """Facts of steps on the CPU, whose schedules and order of particles depend on no others."""
     none = Facts(*[False] * len(Facts._fields))
-    return none._replace(steps=steps, gradients=gradients, records=records, path_bytes=path_bytes)
+    known = {"particles": particles, "steps": steps, "sorted": is_sorted}
+    return none._replace(**known, gradients=gradients, records=records, path_bytes=path_bytes)
 
 
 def _is_uniform(law: Any) -> bool:
