@@ -113,8 +113,8 @@ def _facts_on_cpu(
 ) -> Facts:
     """Facts of steps on the CPU, whose schedules and order of particles depend on no others."""
     none = Facts(*[False] * len(Facts._fields))
-    known = {"particles": particles, "steps": steps, "sorted": is_sorted}
-    return none._replace(**known, gradients=gradients, records=records, path_bytes=path_bytes)
+    none = none._replace(particles=particles, steps=steps, sorted=is_sorted)
+    return none._replace(gradients=gradients, records=records, path_bytes=path_bytes)
 
 
 def _is_uniform(law: Any) -> bool:
