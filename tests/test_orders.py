@@ -25,6 +25,9 @@ def few(monkeypatch):
 
     monkeypatch.setattr(plan, "plan_call", planned)
     monkeypatch.setattr(until_time, "plan_call", planned)
+    plan._planned.cache_clear()  # Plans of the same facts by other tests, and for them.
+    yield
+    plan._planned.cache_clear()
 
 
 @pytest.fixture
