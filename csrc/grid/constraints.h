@@ -188,7 +188,7 @@ MPM_HD void changes_of_constraints(const Constraints<S, D>& c, const Vector<S, D
     change[0] = contact_velocity(only.kind, u, only.normal, only.friction) + S(-1) * u;
     return;
   }
-  if constexpr (std::is_floating_point_v<S>) {  // These are short enough to be compiled twice.
+  if constexpr (std::is_floating_point_v<S>) {  // Instances for dual numbers would be long.
     if (c.count == 2) return changes_of_several<2>(c, v, change);
     if (c.count == 3) return changes_of_several<3>(c, v, change);
   }

@@ -61,9 +61,6 @@ class KnownSlot {
     find_met(true, poses, node_position(poses.a, poses.s.corner, local), met);
     return met;
   }
-  static bool has_mass(const ContactArguments<T, D>& a, int64_t node) {
-    return !a.mass || a.mass[node * a.mass_stride] != T(0);
-  }
   template <class Met>
   static void change(const ContactArguments<T, D>& a, int64_t node, const Met& met) {
     store_node(a.result, node, met.after(load_node<T, D>(a.velocity, a.stride, node)));

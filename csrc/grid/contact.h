@@ -484,8 +484,13 @@ struct alignas(16) KnownTouch {
 // ---- passes over the nodes of a slot
 
 template <class T, int D>
+MPM_HD bool has_mass(const ContactArguments<T, D>& a, int64_t node) {
+  return !(a.mass && a.mass[node * a.mass_stride] == T(0));
+}
+
+template <class T, int D>
 MPM_HD bool may_meet(const ContactArguments<T, D>& a, const ContactSlot<T, D>& s, int64_t node) {
-  return s.near && !(a.mass && a.mass[node * a.mass_stride] == T(0));
+  return s.near && has_mass(a, node);
 }
 
 template <class T, int D>
