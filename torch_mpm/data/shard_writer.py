@@ -143,8 +143,10 @@ def _write_chunks(group: Any, name: str, values: Compressed) -> list[tuple[int, 
     data = _new_dataset(group, name, values.shape, values.dtype, chunk)
     for k, packed in enumerate(values.chunks):
         data.write_direct_chunk((k * values.chunk_frames, *(0,) * (len(chunk) - 1)), packed)
-    stored = map(data.get_chunk_info, range(len(values.chunks)))
-    return [(info.byte_offset, info.size) for info in stored]
+    stored: list[tuple[int, int]] = []
+    # `get_chunk_info` takes a time proportional to the number of chunks, for each of them.
+    data.chunk_iter(lambda info: stored.append((info.byte_offset, info.size)))
+    return stored
 
 
 def _new_dataset(
