@@ -27,6 +27,7 @@ from ..laws.thermal_calls import is_thermal, laws_in, why_not_thermal
 from ..ops.contact import MAX_OBSTACLES, fusible
 from ..state.state import State, tensors_of
 from ..step.clocks import requires_grad
+from ..step.particle_operations import Operations
 from ..step.status import ErrorStatus
 from ..step.step import Step
 from . import graph_segments
@@ -57,7 +58,7 @@ def why_not_fused(step: Any, state: State, n: int, dt: float | Tensor) -> str | 
     if step.on_grid is not None:
         return "it calls on_grid"
     if step.on_particles is not None:
-        return "it calls on_particles"
+        return f"it calls on_particles, {_name_of(step.on_particles)}"
     if step._flip_share and state.impulse is not None and has_mirrors(step):
         return "FLIP keeps a share of the impulses on mirrors"
     materials = [passive(part) for part in laws_of(law)]
@@ -69,8 +70,9 @@ def why_not_fused(step: Any, state: State, n: int, dt: float | Tensor) -> str | 
         return reason
     if any([has_hooks(module) for module in (step, *modules_in(law))]):
         return "there are hooks"
-    if not all([isinstance(b, Obstacle) and fusible(b, 0.0, paths=True) for b in boundaries.entries]):
-        return "a boundary acts by torch operations"
+    others = [b for b in boundaries.entries if not (isinstance(b, Obstacle) and fusible(b, 0.0, paths=True))]
+    if others:
+        return f"a boundary acts by torch operations, {type(others[0]).__name__}"
     if len(boundaries.entries) > MAX_OBSTACLES:
         return f"there are more than {MAX_OBSTACLES} obstacles"
     if torch.is_grad_enabled() and any(part.has_functions for part in laws):
@@ -79,6 +81,12 @@ def why_not_fused(step: Any, state: State, n: int, dt: float | Tensor) -> str | 
 
 
 _FORWARD = CompiledLaw.forward
+
+
+def _name_of(operation: Any) -> str:
+    """Name of an operation on particles, or of the first of several."""
+    first = operation[0] if isinstance(operation, Operations) and len(operation) else operation
+    return getattr(first, "__name__", type(first).__name__)
 
 
 def _why_not_heated(step: Step, x: Tensor) -> str | None:

@@ -9,8 +9,11 @@ from torch import Tensor
 
 from ...state.state import State
 from ...step.particle_operations import Timed, of_particles
-from ..gradients import Numbers
+from ..gradients import Numbers, requires_grad
 from ..selections import in_box
+
+PIC_BELOW = -0.001
+"""Value of `rpic_damping` below which particles have no C, as in warp-mpm."""
 
 
 class WithoutAffine(Timed):
@@ -22,7 +25,13 @@ class WithoutAffine(Timed):
 
 
 class DampedAffine(Timed):
-    """RPIC: the symmetric part of C minus a share, a number or a tensor [] that may require grad."""
+    """RPIC: C becomes (1 − a) C + a/2 (C − Cᵀ), so that its symmetric part loses a share a; 1 is RPIC (Jiang et al.
+    2015, "The affine particle-in-cell method", section 5.3). The blend is that of warp-mpm, from which PhysGaussian
+    derives.
+
+    Args:
+        share: a: a number, or a tensor [] that may require grad.
+    """
 
     def __init__(self, share: float | Tensor) -> None:
         super().__init__()
@@ -116,12 +125,17 @@ def release_times_in_boxes(
     return times
 
 
+def is_pic(damping: float | Tensor) -> bool:
+    """Whether `rpic_damping` means PIC."""
+    return not requires_grad(damping) and float(damping) < PIC_BELOW
+
+
 def affine_operations(damping: float | Tensor) -> list[Timed]:
     """Operation of `rpic_damping` on C."""
-    if isinstance(damping, Tensor) and damping.requires_grad:
+    if requires_grad(damping):
         return [DampedAffine(damping)]
     share = float(damping)
-    return [] if share == 0 else [WithoutAffine() if share < 0 else DampedAffine(share)]
+    return [] if share == 0 else [WithoutAffine() if is_pic(share) else DampedAffine(share)]
 
 
 def enabled_operations(selection: Tensor | None) -> list[Timed]:

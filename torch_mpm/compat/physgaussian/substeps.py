@@ -21,7 +21,7 @@ from ..node_conditions import NodeDamping
 from .condition_list import Nodes, acts, changes
 from .descendants import DescendantMethods
 from .law_choice import chosen_law, kinds_of, law_indices, needs_moduli
-from .particles import Anchored, affine_operations, enabled_operations
+from .particles import Anchored, affine_operations, enabled_operations, is_pic
 from .weighted_force import WeightedForceStep
 
 DEFAULT_FLIP = 0.8
@@ -217,8 +217,7 @@ class Substeps(DescendantMethods):
 
     @property
     def _is_pic(self) -> bool:
-        damping = self.parameters.get("rpic_damping", 0.0)
-        return not (isinstance(damping, Tensor) and damping.requires_grad) and float(damping) < 0
+        return is_pic(self.parameters.get("rpic_damping", 0.0))
 
     @property
     def _bounds(self) -> tuple[float, float] | None:
