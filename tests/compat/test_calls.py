@@ -72,7 +72,10 @@ ELEMENTS = {
     "add_sphere_collider": "center radius surface",
     "step": "frame_dt print_stat smry_writer",
     "particle_info": "",
+    "add_mesh": "triangles material color sample_density velocity translation emmiter_id",
     "read_restart": "num_particles pos vel material color",
+    "write_particles": "fn slice_size",
+    "write_particles_ply": "fn",
 }
 CLASSES = [
     (MPM_Simulator_WARP, SIMULATOR),

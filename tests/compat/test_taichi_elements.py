@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from torch_mpm.compat.taichi_elements import MPMSolver
+from torch_mpm.compat.taichi_elements import MPMSolver, particle_io
+from torch_mpm.geometry import point_files
 
 WATER, ELASTIC, SNOW, SAND, STATIONARY = range(5)
 
@@ -230,6 +231,66 @@ def test_a_restart_continues():
     assert unbounded.particle_info()["position"].max() < -0.4
 
 
+def tetrahedron(size=0.4, low=0.3):
+    """Triangles [4, 9] of a corner of a cube."""
+    pytest.importorskip("trimesh")
+    corners = low + size * np.vstack([np.zeros(3), np.eye(3)])
+    return corners[[[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]].reshape(4, 9)
+
+
+@pytest.mark.parametrize("shape", [(4, 9), (4, 3, 3)])
+def test_a_mesh_is_filled(shape):
+    """8 particles in each cell of a tetrahedron that is moved, all inside, with the mean of its corners."""
+    solver = MPMSolver((40,) * 3)
+    triangles = torch.tensor(tetrahedron()).reshape(shape)
+    torch.manual_seed(3)
+    solver.add_mesh(triangles, MPMSolver.material_elastic, 0x123456, velocity=(0, 0, -1.0), translation=(0.1, 0, 0))
+    info = solver.particle_info()
+    inside = info["position"] - [0.4, 0.3, 0.3]
+    assert (inside > -1e-6).all() and (inside.sum(1) < 0.4 + 1e-6).all()
+    assert len(inside) == pytest.approx(8 * 0.4**3 / 6 * 40**3, rel=0.03)
+    np.testing.assert_allclose(inside.mean(0), 0.1, atol=2e-3)
+    assert (info["velocity"] == [0, 0, -1.0]).all() and (info["color"] == 0x123456).all()
+    torch.manual_seed(3)
+    other = MPMSolver((40,) * 3)
+    other.add_mesh(triangles, MPMSolver.material_elastic, translation=[0.1, 0, 0], sample_density=8)
+    assert np.array_equal(other.particle_info()["position"], info["position"])
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_files_of_particles(dim, tmp_path):
+    """Positions to 24 bits and velocities to 8 bits of their range, and colours, of both formats."""
+    solver = MPMSolver((16,) * dim)
+    rng = np.random.default_rng(0)
+    for color, velocity in ((0xFF8001, 1.0), (0x0000FF, -2.0)):
+        solver.add_particles(rng.uniform(0.3, 0.7, (20, dim)), ELASTIC, color, (velocity, *(0.0,) * (dim - 1)))
+    info = solver.particle_info()
+    solver.write_particles(f"{tmp_path}/00001")
+    with np.load(tmp_path / "00001.npz") as data:
+        ranges, both, color = data["ranges"], data["x_and_v"], data["color"]
+    assert ranges.shape == (2, dim, 2) and ranges.dtype == np.float32 and both.dtype == np.uint32
+    low, high = ranges[0].T.astype(np.float64)
+    x = low + (both >> 8) / (2**24 - 1) * (high - low)
+    np.testing.assert_allclose(x, info["position"], atol=1.1 * (high - low).max() / 2**24)
+    low, high = ranges[1].T.astype(np.float64)
+    v = low + (both & 255) / 255 * (high - low)
+    np.testing.assert_allclose(v, info["velocity"], atol=3.01 / 255)
+    assert color.dtype == np.uint8 and color[0].tolist() == [255, 128, 1] and color[-1].tolist() == [0, 0, 255]
+    solver.write_particles_ply(tmp_path / "1.ply")
+    found = point_files.read(tmp_path / "1.ply", 3)
+    np.testing.assert_array_equal(found.x[:, :dim].astype(np.float32), info["position"])
+    assert (found.x[:, dim:] == 0).all() and found.fields["blue"][0] == 1 and found.fields["red"][0] == 255
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["00001.npz", "1.ply"]
+
+
+def test_a_file_of_particles_at_one_place(tmp_path):
+    """Ranges are not empty, also where float32 has no number within 1e-5."""
+    x = np.full((3, 2), [1000.0, 0.5], np.float32)
+    particle_io.write_particles(tmp_path / "one.npz", x, 0 * x, np.zeros(3, np.int32))
+    with np.load(tmp_path / "one.npz") as data:
+        assert (data["ranges"][:, :, 1] > data["ranges"][:, :, 0]).all() and (data["x_and_v"] == 0).all()
+
+
 @pytest.mark.parametrize(
     ("call", "error", "message"),
     [
@@ -245,7 +306,14 @@ def test_a_restart_continues():
         (lambda: MPMSolver((8, 8), support_plasticity=False).add_cube((0, 0), (1, 1), 3), ValueError, "snow and sand"),
         (lambda: MPMSolver((8, 8)).add_surface_collider((0, 0), (0, 1), 0, 0.2), ValueError, "friction must be 0"),
         (lambda: MPMSolver((8, 8)).add_surface_collider((0, 0), (0, 1), 5), ValueError, "surface must be one of"),
-        (lambda: MPMSolver((8, 8)).add_mesh(None, 1), NotImplementedError, "voxelizer"),
+        (lambda: MPMSolver((8, 8)).add_mesh(None, 1), ValueError, "add_mesh needs a solver of 3 dimensions"),
+        (
+            lambda: MPMSolver((8,) * 3).add_mesh(np.zeros((4, 6)), 1),
+            ValueError,
+            r"triangles must have shape \[T, 9\] or \[T, 3, 3\], got",
+        ),
+        (lambda: MPMSolver((8,) * 3).add_mesh(tetrahedron()[1:], 1), ValueError, "mesh .* is not closed"),
+        (lambda: MPMSolver((8, 8)).write_particles("x"), ValueError, "write_particles needs particles"),
         (lambda: MPMSolver((8,) * 3).add_ngon(5, (0, 0), 1, 0, 1), ValueError, "add_ngon needs a solver of 2"),
         (
             lambda: MPMSolver((8, 8)).add_cube((0, 0), (-1, 1), 1),

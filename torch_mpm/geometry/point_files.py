@@ -1,4 +1,4 @@
-"""Files of points: NumPy arrays, tables of numbers, and PLY."""
+"""Files of points: NumPy arrays, tables of numbers, and PLY, which is written too."""
 
 from __future__ import annotations
 
@@ -7,16 +7,18 @@ import csv
 import io
 import itertools
 import math
+import os
 import re
 import zipfile
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
 import numpy as np
 
 from ..data import host_memory
+from ..data.whole_files import write_whole
 from ..files import check_file
 from .surface_mesh import Array
 
@@ -305,6 +307,36 @@ def _read_ply(path: Path, dim: int | None) -> PointFile:
         x = np.stack([fields.pop(axis).astype(np.float64) for axis in "xyz"], 1)
     volume = fields.pop("volume", None)
     return PointFile(x, None if volume is None else volume.astype(np.float64), fields)
+
+
+def ply_header(rows: np.dtype[Any], count: int) -> bytes:
+    """Header of a binary little-endian PLY file of vertices.
+
+    Args:
+        rows: dtype of a row, with a name for each property and types among `PLY_TYPES`.
+        count: number of vertices.
+    """
+    types = {code: name for name, code in reversed(PLY_TYPES.items())}  # "float" rather than "float32".
+    lines = [f"property {types[rows[name].str[1:]]} {name}" for name in rows.names or ()]
+    head = ["ply", "format binary_little_endian 1.0", f"element vertex {count}", *lines, "end_header"]
+    return ("\n".join(head) + "\n").encode()
+
+
+def write_ply(path: str | os.PathLike[str], columns: Mapping[str, Array]) -> None:
+    """Write a binary little-endian PLY file of vertices, which appears when it is complete.
+
+    Args:
+        path: the file.
+        columns: the properties in their order, [P] each, in types among `PLY_TYPES`.
+
+    Raises:
+        OSError: when it cannot be written; nothing remains of it.
+    """
+    types = np.dtype([(name, values.dtype.newbyteorder("<")) for name, values in columns.items()])
+    rows = np.empty(len(next(iter(columns.values()))), types)
+    for name, values in columns.items():
+        rows[name] = values
+    write_whole(Path(path), ply_header(types, len(rows)) + rows.tobytes())
 
 
 def _count(text: str) -> int:

@@ -124,9 +124,7 @@ def names_of(harmonics: int) -> list[str]:
 
 def header_of(count: int, harmonics: int) -> bytes:
     """Header of a file."""
-    lines = [f"property float {name}" for name in names_of(harmonics)]
-    head = ["ply", "format binary_little_endian 1.0", f"element vertex {count}", *lines, "end_header"]
-    return ("\n".join(head) + "\n").encode()
+    return point_files.ply_header(np.dtype([(name, "<f4") for name in names_of(harmonics)]), count)
 
 
 def size_of(count: int, harmonics: int) -> int:

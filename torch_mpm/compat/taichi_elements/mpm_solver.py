@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import numbers
+import os
 import warnings
 from collections.abc import Sequence
 from typing import Any, ClassVar
@@ -21,9 +22,9 @@ from ...step.step import Step
 from ..gradients import refuse_grad
 from ..node_conditions import outer_planes, surface_margin
 from ..physgaussian.particles import Anchored
-from . import materials
+from . import materials, particle_io
 from .materials import law_indices, mixture_of, shapeless
-from .seeding import in_box, in_ellipsoid, in_polygon
+from .seeding import in_box, in_ellipsoid, in_mesh, in_polygon
 
 MOST_SUBSTEPS = 10**9
 """Largest number of substeps of a call."""
@@ -262,16 +263,32 @@ class MPMSolver:
         index = (torch.as_tensor(np.asarray(texture)) > 0.1).nonzero()
         self.add_particles(torch.tensor([offset_x, offset_y]) + self.dx * index, new_material, color)
 
-    def add_mesh(self, triangles: Any, material: int, **options: Any) -> None:
-        """Raises: the voxelizer of taichi_elements is not part of this package.
+    def add_mesh(
+        self,
+        triangles: Any,
+        material: int,
+        color: int = WHITE,
+        sample_density: float | None = None,
+        velocity: Sequence[float] | None = None,
+        translation: Sequence[float] | None = None,
+        emmiter_id: int = 0,
+    ) -> None:
+        """Particles at jittered positions in a closed mesh (3-D), sample_density in each cell, by default 8.
+
+        Args:
+            triangles: their corners [T, 9] or [T, 3, 3] [m].
+            translation: displacement of the mesh [m].
+            material, color, sample_density, velocity, emmiter_id: as for `add_particles`.
 
         Raises:
-            NotImplementedError: always.
+            ImportError: without trimesh.
+            ValueError: in 2-D, for triangles of another shape, a mesh that is not closed, or one with no space.
         """
-        raise NotImplementedError(
-            "add_mesh needs the voxelizer of taichi_elements: sample the mesh, for example with torch_mpm.seed, and "
-            "call add_particles"
-        )
+        if self.dim != 3:
+            raise ValueError("add_mesh needs a solver of 3 dimensions")
+        shift = (0.0,) * 3 if translation is None else _vector("translation", translation, 3)
+        points = in_mesh(triangles, shift, self.dx, self._density(sample_density))
+        self.add_particles(points, material, color, velocity, emmiter_id)
 
     def add_particles(
         self,
@@ -332,6 +349,30 @@ class MPMSolver:
         if self.use_emitter_id:
             info["emitter_ids"] = self.emitter_ids
         return {name: value.detach().cpu().numpy().copy() for name, value in info.items()}
+
+    def write_particles(self, fn: str | os.PathLike[str], slice_size: int = 1000000) -> None:
+        """Write positions, velocities and colors as an .npz file with quantised numbers, see `particle_io`.
+
+        Args:
+            fn: the file.
+            slice_size: not used.
+
+        Raises:
+            OSError: when it cannot be written; nothing remains of it.
+            ValueError: without particles.
+        """
+        check_count("slice_size", slice_size, 1)
+        info = self.particle_info()
+        particle_io.write_particles(fn, info["position"], info["velocity"], info["color"])
+
+    def write_particles_ply(self, fn: str | os.PathLike[str]) -> None:
+        """Write positions and colors as a binary PLY file.
+
+        Raises:
+            OSError: when it cannot be written; nothing remains of it.
+        """
+        info = self.particle_info()
+        particle_io.write_particles_ply(fn, info["position"], info["color"])
 
     # ---- time
 
