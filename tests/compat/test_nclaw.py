@@ -201,6 +201,20 @@ def test_training_recovers_a_law_through_the_simulator(device):
     assert float(law.log_E.detach().exp()) == pytest.approx(5e4, rel=0.1)
 
 
+@pytest.mark.parametrize(
+    "name", ["SVDMetaElasticity", "SplineMetaElasticity", "SVDMetaPlasticity", "SplineMetaPlasticity"]
+)
+def test_laws_without_gradient_at_rest_are_refused(name):
+    with pytest.raises(NotImplementedError, match=f"{name} has no gradient where two stretches are equal"):
+        getattr(material, name)(NETWORK)
+
+
+def test_particles_without_mass_are_refused():
+    model = sim.MPMModelBuilder().parse_cfg(SIM | {"eps": 0.0}).finalize()
+    with pytest.raises(NotImplementedError, match="MPMExtraSim moves particles without mass"):
+        sim.MPMExtraSim(model)
+
+
 def test_what_cannot_be_done_is_said():
     with pytest.raises(ValueError, match="'noslip' sets no velocity at all"):
         sim.MPMModelBuilder().parse_cfg(SIM | {"bc": "noslip"})
@@ -208,8 +222,8 @@ def test_what_cannot_be_done_is_said():
         sim.MPMModelBuilder().parse_cfg(SIM)
     with pytest.raises(ValueError, match="call parse_cfg first"):
         sim.MPMModelBuilder().finalize()
-    with pytest.raises(ValueError, match="shape must be of type 'cube', got 'mesh'"):
-        sim.MPMInitData.get({"shape": {"type": "mesh"}})
+    with pytest.raises(ValueError, match="shape must be of type 'cube' or 'mesh', got 'cylinder'"):
+        sim.MPMInitData.get({"shape": {"type": "cylinder"}})
     with pytest.raises(ValueError, match="nonlinearity must be one of"):
         material.PlainMetaElasticity(SimpleNamespace(**{**vars(NETWORK), "nonlinearity": "step"}))
     model = sim.MPMModelBuilder().parse_cfg(SIM | {"eps": 0.0}).finalize()

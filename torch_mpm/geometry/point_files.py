@@ -90,15 +90,27 @@ def _read_npy(path: Path, dim: int | None) -> PointFile:
 
 
 def _read_npz(path: Path, dim: int | None) -> PointFile:
+    arrays = arrays_of(path, "x", "volume")
+    if "x" not in arrays:
+        with zipfile.ZipFile(path) as archive:
+            names = sorted(item.filename.removesuffix(".npy") for item in archive.infolist())
+        raise ValueError(f"it must hold an array 'x' of positions, got {names}")
+    return PointFile(arrays["x"], arrays.get("volume"), {})
+
+
+def arrays_of(path: Path, *names: str) -> dict[str, Array]:
+    """Those of some arrays that an .npz file has, float64.
+
+    Raises:
+        zipfile.BadZipFile, ValueError: for a damaged file, or an array that holds no numbers or does not fit in memory.
+    """
     with zipfile.ZipFile(path) as archive:
         sizes = {item.filename.removesuffix(".npy"): item.file_size for item in archive.infolist()}
-        if "x" not in sizes:
-            raise ValueError(f"it must hold an array 'x' of positions, got {sorted(sizes)}")
         arrays = {}
-        for name in {"x", "volume"} & sizes.keys():
+        for name in (name for name in names if name in sizes):
             with archive.open(name + ".npy") as handle:
                 arrays[name] = _array(handle, sizes[name])
-    return PointFile(arrays["x"], arrays.get("volume"), {})
+    return arrays
 
 
 def _array(handle: IO[bytes], size: int) -> Array:

@@ -334,3 +334,33 @@ class InvariantFullMetaPlasticity(_InvariantFull, _NetworkPlasticity):
     def __init__(self, cfg: Any) -> None:
         super().__init__(cfg)
         self.normalize_input = True
+
+
+class _Unavailable(Material):
+    """Raises: a law of NCLaw that is not symmetric in the stretches, so that it has no gradient at F = I.
+
+    Raises:
+        NotImplementedError: always.
+    """
+
+    def __init__(self, cfg: Any = None) -> None:
+        raise NotImplementedError(
+            f"{type(self).__name__} has no gradient where two stretches are equal, as at F = I, since its function is "
+            "not symmetric in them: use InvariantFull networks, or torch_mpm.isotropic with a symmetric network"
+        )
+
+
+class SVDMetaElasticity(_Unavailable):
+    """A network of σ in the axes of the singular vectors, which raises."""
+
+
+class SplineMetaElasticity(_Unavailable):
+    """Splines of the stretches, of areas and of the volume, which raise."""
+
+
+class SVDMetaPlasticity(_Unavailable):
+    """A network of σ in the axes of the singular vectors, which raises."""
+
+
+class SplineMetaPlasticity(_Unavailable):
+    """Splines of the stretches, of areas and of the volume, which raise."""

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 from collections.abc import Sequence
+from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from ...data.whole_files import is_name
 from ..gradients import refuse_grad
 from ..settings import setting
+from .meshes import points_in_mesh
 
 if TYPE_CHECKING:
     from .sim import MPMModel
@@ -115,7 +119,10 @@ class MPMInitData:
         pos: positions [P, 3] [m].
         lin_vel, ang_vel: velocity [m/s] and spin [rad/s] about `center` [m], which is the mean position if None.
         ind_vel: velocity of each particle [P, 3] [m/s], in the place of these.
+        assets: of the class, the folder of NCLaw's meshes.
     """
+
+    assets: ClassVar[str | os.PathLike[str] | None] = None
 
     rho: float
     clip_bound: float
@@ -136,21 +143,49 @@ class MPMInitData:
 
     @classmethod
     def get(cls, cfg: Any) -> MPMInitData:
-        """Body of a configuration with rho, clip_bound, span and a shape of type "cube".
+        """Body of a configuration with rho, clip_bound, span and a shape of type "cube" or "mesh".
 
         Raises:
-            ValueError: for another shape, which `torch_mpm.seed` fills: MPMInitData(..., pos=points.x.numpy()).
+            ImportError, OSError, ValueError: as `get_mesh`, and for another shape.
         """
         shape = setting(cfg, "shape")
-        if setting(shape, "type") != "cube":
+        kind = setting(shape, "type")
+        if kind not in ("cube", "mesh"):
             raise ValueError(
-                f"shape must be of type 'cube', got {setting(shape, 'type')!r}: fill others by torch_mpm.seed and pass "
+                f"shape must be of type 'cube' or 'mesh', got {kind!r}: fill others by torch_mpm.seed and pass "
                 "positions and volume to MPMInitData"
             )
         center, size, resolution, mode = (setting(shape, name) for name in ("center", "size", "resolution", "mode"))
-        cube = cls.get_cube(center, size, resolution, mode, setting(shape, "sort", None))
+        arguments = center, size, resolution, mode, setting(shape, "sort", None)
+        body = cls.get_cube(*arguments) if kind == "cube" else cls.get_mesh(setting(shape, "name"), *arguments)
         rho, clip_bound, span = (setting(cfg, name) for name in ("rho", "clip_bound", "span"))
-        return cls(rho=rho, clip_bound=clip_bound, span=tuple(span), **cube)
+        return cls(rho=rho, clip_bound=clip_bound, span=tuple(span), **body)
+
+    @classmethod
+    def get_mesh(
+        cls,
+        name: str,
+        center: Sequence[float],
+        size: Sequence[float],
+        resolution: int,
+        mode: str,
+        sort: int | None = None,
+    ) -> dict[str, Any]:
+        """A mesh of the folder `assets`, scaled so that its longest edge is 1 and by `size` then; see
+        `meshes.points_in_mesh`.
+
+        Raises:
+            ImportError: without trimesh.
+            OSError: for a file that is missing or cannot be read.
+            ValueError: without `assets`, for a name that is a path, or for points that are not there.
+        """
+        if cls.assets is None:
+            raise ValueError("MPMInitData.assets must be the folder nclaw/assets, before a mesh is filled")
+        if not isinstance(name, str) or not is_name(name):
+            raise ValueError(f"name of a mesh must have letters, digits, _ and - alone, got {name!r:.100}")
+        points, volume = points_in_mesh(Path(cls.assets), name, resolution, mode)
+        pos, middle = _sorted(points, sort) * np.array(size, float), np.array(center, float)
+        return {"num_particles": len(pos), "vol": volume * math.prod(size), "pos": pos + middle, "center": middle}
 
     @staticmethod
     def get_cube(
@@ -166,8 +201,7 @@ class MPMInitData:
             pos = np.random.default_rng(0).uniform(-edges / 2, edges / 2, (math.prod(counts), 3))
         else:
             raise ValueError(f"mode must be 'uniform' or 'random', got {mode!r}")
-        if sort is not None:
-            pos = pos[np.argsort(-pos[:, sort], kind="stable")]
+        pos = _sorted(pos, sort)
         vol = math.prod(edges) / len(pos)
         return {"num_particles": len(pos), "vol": vol, "pos": pos + middle, "center": middle}
 
@@ -175,6 +209,14 @@ class MPMInitData:
         """[m/s]"""
         refuse_grad("arrays have no gradient; pass tensors to the simulator", lin_vel=value)
         self.lin_vel = np.array(value, float)
+
+    def zero_lin_vel(self) -> None:
+        """Set the velocity to zero."""
+        self.lin_vel = np.zeros(3)
+
+    def zero_ang_vel(self) -> None:
+        """Set the spin to zero."""
+        self.ang_vel = np.zeros(3)
 
     def set_ang_vel(self, value: Sequence[float]) -> None:
         """[rad/s]"""
@@ -191,6 +233,11 @@ class MPMInitData:
         if self.ind_vel is not None:
             return self.ind_vel
         return self.lin_vel + np.cross(self.ang_vel, self.pos - self.center)
+
+
+def _sorted(points: np.ndarray, axis: int | None) -> np.ndarray:
+    """Points in descending order of a coordinate; in their own order for None."""
+    return points if axis is None else points[np.argsort(-points[:, axis], kind="stable")]
 
 
 class _Initializer:

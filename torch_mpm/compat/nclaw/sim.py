@@ -22,6 +22,7 @@ from .particles import MPMInitData, MPMState, MPMStateInitializer, MPMStatics, M
 __all__ = [
     "MPMCacheDiffSim",
     "MPMDiffSim",
+    "MPMExtraSim",
     "MPMForwardSim",
     "MPMInitData",
     "MPMModel",
@@ -214,3 +215,17 @@ class MPMForwardSim(MPMSim):
         after = self.model.advance(statics, *state.to_torch())
         state.from_torch(*after)
         return after
+
+
+class MPMExtraSim(MPMSim):
+    """Raises: positions of further particles that the velocities of the nodes move.
+
+    Raises:
+        NotImplementedError: always.
+    """
+
+    def __init__(self, model: MPMModel) -> None:
+        raise NotImplementedError(
+            "MPMExtraSim moves particles without mass through a grid that is not stored here: add them as a body of "
+            "low density, or call torch_mpm.ops.g2p with the nodes of torch_mpm.ops.p2g"
+        )
