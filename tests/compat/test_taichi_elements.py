@@ -355,6 +355,15 @@ def test_options_of_the_storage_are_reported():
         MPMSolver((8, 8), quant=True, use_g2p2g=True)
 
 
+def test_the_number_of_particles_is_a_field():
+    solver = MPMSolver((8, 8))
+    assert solver.n_particles[None] == solver.n_particles == 0
+    solver.add_particles(np.full((3, 2), 0.5), ELASTIC)
+    assert solver.n_particles[None] == solver.n_particles == 3 and f"{solver.n_particles}" == "3"
+    with pytest.raises(IndexError, match="a field without axes must have the index None, got 0"):
+        solver.n_particles[0]
+
+
 def test_no_particles_are_added_and_tensors_are_vectors():
     solver = MPMSolver((8, 8))
     solver.add_particles(np.zeros((0, 2)), MPMSolver.material_water)

@@ -41,6 +41,15 @@ UNBOUNDED = 16
 """Size of an unbounded domain in sizes of the bounded one."""
 
 
+class Number(int):
+    """Whole number that is also read as a field of Taichi without axes, by the index None."""
+
+    def __getitem__(self, index: None) -> int:
+        if index is not None:
+            raise IndexError(f"a field without axes must have the index None, got {index!r}")
+        return int(self)
+
+
 class MPMSolver:
     """Explicit MLS-MPM with APIC on a lattice of `res` cells, of water, elastic bodies, snow and sand.
 
@@ -173,9 +182,9 @@ class MPMSolver:
     # ---- particles
 
     @property
-    def n_particles(self) -> int:
-        """P"""
-        return len(self.material)
+    def n_particles(self) -> Number:
+        """P, also read as n_particles[None]."""
+        return Number(len(self.material))
 
     def clear_particles(self) -> None:
         """Remove all particles."""
