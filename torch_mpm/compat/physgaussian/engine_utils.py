@@ -18,6 +18,8 @@ from ...geometry.surface_mesh import Array
 if TYPE_CHECKING:
     from .simulator import MPM_Simulator_WARP
 
+__all__ = ["particle_position_tensor_to_ply", "particle_position_to_ply", "save_data_at_frame"]
+
 DIGITS = 10
 """Digits of the number of a frame in the name of its file."""
 

@@ -25,9 +25,8 @@ class WithoutAffine(Timed):
 
 
 class DampedAffine(Timed):
-    """RPIC: C becomes (1 − a) C + a/2 (C − Cᵀ), so that its symmetric part loses a share a; 1 is RPIC (Jiang et al.
-    2015, "The affine particle-in-cell method", section 5.3). The blend is that of warp-mpm, from which PhysGaussian
-    derives.
+    """C becomes (1 − a) C + a/2 (C − Cᵀ), so that its symmetric part loses a share a: 0 is APIC, 1 is RPIC (Jiang et
+    al. 2015, "The affine particle-in-cell method"). The blend is that of warp-mpm, from which PhysGaussian derives.
 
     Args:
         share: a: a number, or a tensor [] that may require grad.
