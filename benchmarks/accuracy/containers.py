@@ -3,16 +3,17 @@
     python -m benchmarks.accuracy.containers             # 10 s of each, some minutes on one core
     python -m benchmarks.accuracy.containers --quick     # seconds
 
-Water starts at rest under its own pressure. Particles count as outside when they are more than dx/2 below the floor, in
-a wall, or beyond the container. The force is the vertical momentum that obstacles and walls take in the last fifth of
-the time, over that of the weight. The pressure is the volume average over layers of particles at least dx away from
-obstacles and 1.5 dx below the surface, over the weight per area of the water above in a column that is open to the
-surface; the table has the least-squares factor between the two. The stress is that per volume of the column, averaged
-with a hat function of height 4 dx: the pressure times the volume of the particles there over the volume of the column,
-which balances the weight. The filling is the volume of these particles over that of the column: the volume that
-particles store drifts from that which they take up, and their pressure with it. A tank of walls of the domain, without
-obstacles, is the reference. Averages are over records of the last fifth of the time. The block slides without friction
-and should keep its speed.
+Water starts at rest under its own pressure. Particles count as outside when they are more than dx below the floor, in a
+wall, or beyond the container. Contact acts at the nodes in a wall, so that material reaches the first of them: up to
+dx, and dx/2 on average, where the surface is not one of nodes. The depth is the largest in all records. The force is
+the vertical momentum that obstacles and walls take in the last fifth of the time, over that of the weight. The pressure
+is the volume average over layers of particles at least dx away from obstacles and 1.5 dx below the surface, over the
+weight per area of the water above in a column that is open to the surface; the table has the least-squares factor
+between the two. The stress is that per volume of the column, averaged with a hat function of height 4 dx: the pressure
+times the volume of the particles there over the volume of the column, which balances the weight. The filling is the
+volume of these particles over that of the column: the volume that particles store drifts from that which they take up,
+and their pressure with it. A tank of walls of the domain, without obstacles, is the reference. Averages are over
+records of the last fifth of the time. The block slides without friction and should keep its speed.
 """
 
 from __future__ import annotations
@@ -164,13 +165,14 @@ def run(case: Container, dx: float, duration: float) -> dict[str, Any]:
     records, begin = 50, time.perf_counter()
     n = math.ceil(duration / records / dt)
     dt = duration / records / n
-    profile, left, taken = Profile(case, dx), 0, torch.zeros(())
+    profile, left, depth, taken = Profile(case, dx), 0, 0.0, torch.zeros(())
     for k in range(records):
         if k == records * 4 // 5:
             taken = state.impulse[0, :, 1].sum().double()
         state = mpm.rollout(step, state, n, dt)
         step.check(state)
-        left = max(left, int(outside(case, obstacles, state.x, dx).sum()))
+        depths = depth_of(case, obstacles, state.x)
+        left, depth = max(left, int((depths > dx).sum())), max(depth, float(depths.max()) / dx)
         if k >= records * 4 // 5:
             profile.add(state, obstacles)
     taken = state.impulse[0, :, 1].sum().double() - taken
@@ -180,6 +182,7 @@ def run(case: Container, dx: float, duration: float) -> dict[str, Any]:
         "particles": len(state),
         "steps": records * n,
         "outside": left,
+        "depth": depth,
         "force": -float(taken) / (weight * 0.2 * duration),
         "pressure": profile.factor(),
         "stress": profile.stress(),
@@ -278,10 +281,10 @@ class Profile:
         return float((share * pressure * weight).sum() / (share * weight * weight).sum())
 
 
-def outside(case: Container, obstacles: list[Any], x: Tensor, dx: float) -> Tensor:
-    """Which particles are more than dx/2 below the floor, in obstacles or beyond these, bool [P]."""
-    beyond = (x[:, 1] < -0.5 * dx) | (x[:, 0].abs() > 0.5 * SIDE + DEPTH + 0.5 * dx)
-    return beyond | (distance(obstacles, x) < -0.5 * dx)
+def depth_of(case: Container, obstacles: list[Any], x: Tensor) -> Tensor:
+    """How far particles are below the floor, in obstacles or beyond these [P] [m]; negative inside the container."""
+    beyond = torch.maximum(-x[:, 1], x[:, 0].abs() - (0.5 * SIDE + DEPTH))
+    return torch.maximum(beyond, -distance(obstacles, x))
 
 
 def slide(seams: int, dx: float, duration: float) -> dict[str, Any]:
@@ -304,9 +307,9 @@ def measure(cases: Sequence[Container], dx: float, duration: float) -> dict[str,
         found = run(case, dx, duration)
         result["cases"].append(found)
         print(
-            f"{found['name']}: {found['outside']} of {found['particles']} particles outside, force "
-            f"{found['force']:.4f}, pressure {found['pressure']:.4f}, stress {found['stress']:.4f}, filling "
-            f"{found['filling']:.4f}, {found['seconds']:.0f} s",
+            f"{found['name']}: {found['outside']} of {found['particles']} particles outside, depth "
+            f"{found['depth']:.2f} dx, force {found['force']:.4f}, pressure {found['pressure']:.4f}, stress "
+            f"{found['stress']:.4f}, filling {found['filling']:.4f}, {found['seconds']:.0f} s",
             flush=True,
         )
     result["block"] = slide(10, dx, min(1.0, duration))
@@ -319,12 +322,13 @@ def text(result: dict[str, Any]) -> str:
     lines += [(__doc__ or "").split("\n\n", 2)[2].strip(), ""]
     lines += [f"dx = {result['dx']:g} m, {result['duration']:g} s, float32.", ""]
     header = (
-        *("container", "particles", "steps", "outside", "force", "pressure", "stress", "filling"),
+        *("container", "particles", "steps", "outside", "depth, dx", "force", "pressure", "stress", "filling"),
         *("mean speed m/s", "seconds"),
     )
     rows = [
         (
             *(c["name"], c["particles"], c["steps"], c["outside"]),
+            f"{c['depth']:.2f}",
             *(f"{c[name]:.4f}" for name in ("force", "pressure", "stress", "filling", "speed")),
             f"{c['seconds']:.0f}",
         )
