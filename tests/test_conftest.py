@@ -1,11 +1,14 @@
-"""The test session itself: a GPU is tested, or the session reports why not."""
+"""The test session itself: a GPU is tested, or the session reports why not; threads, and which cases are quick."""
 
+import itertools
 import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+import torch
+from pairs import in_pairs
 
 TESTS = Path(__file__).parent
 
@@ -51,3 +54,20 @@ def test_the_package_that_the_environment_names_is_tested(tmp_path: Path) -> Non
     (tmp_path / "torch_mpm" / "__init__.py").write_text("raise ImportError('another build')")
     done = session(PYTHONPATH=str(tmp_path), TORCH_MPM_CUDA="0")
     assert done.returncode != 0 and "another build" in done.stdout + done.stderr
+
+
+def test_quick_cases_have_all_pairs_of_values() -> None:
+    axes = {"a": "uvwxyz", "b": range(5), "c": [True, False], "d": [None, 1.0, 2.0]}
+    names, cases = in_pairs(**axes)
+    assert names == tuple(axes) and [case.values for case in cases] == list(itertools.product(*axes.values()))
+    quick = [dict(zip(names, case.values, strict=True)) for case in cases if not case.marks]
+    assert len(quick) < len(cases) // 4
+    for one, other in itertools.combinations(names, 2):
+        met = {(case[one], case[other]) for case in quick}
+        assert met == set(itertools.product(axes[one], axes[other]))
+
+
+@pytest.mark.parametrize("call", ["first", "second"])
+def test_threads_that_a_test_has_set_do_not_stay(call: str) -> None:
+    assert torch.get_num_threads() <= 2
+    torch.set_num_threads(3)

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import torch
 from helpers import random_blocks
+from pairs import in_pairs
 from torch import Tensor
 
 import torch_mpm as mpm
@@ -491,8 +492,9 @@ def any_obstacles(count: int, dim: int, random: torch.Generator) -> list[Obstacl
     return found
 
 
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-@pytest.mark.parametrize("walls", [None, "separate", "mirror"])
+@pytest.mark.parametrize(
+    *in_pairs(dtype=[torch.float64, torch.float32], walls=[None, "separate", "mirror"], dim=[2, 3])
+)
 def test_the_kernel_is_what_torch_operations_are(device, dim, dtype, walls):
     """For obstacles of all shapes, but for nodes where two surfaces are equally near to rounding."""
     if dim == 3 and (dtype == torch.float32 or walls == "separate"):
@@ -530,8 +532,9 @@ def test_impulses_of_corners_add_up_to_the_change_of_momentum(device, dim, kind)
 # ---- implicit steps
 
 
-@pytest.mark.parametrize("form", ["floor under walls", "planes", "own shape"])
-@pytest.mark.parametrize("kind", ["separate", "sticky"])
+@pytest.mark.parametrize(
+    *in_pairs(form=["floor under walls", "planes", "own shape"], kind=["separate", "sticky"], dim=[2, 3])
+)
 def test_implicit_bounds_behind_a_corner_are_those_of_all_its_faces(device, dim, form, kind):
     blocks, velocity = nodes(dim, device)
     tested, expected = expected_in_tank(blocks, velocity, kind)

@@ -8,6 +8,7 @@ import pytest
 import torch
 from cases.heat import FLOAT, block, check_gradients, random_like
 from helpers import relative_error
+from pairs import in_pairs
 
 import torch_mpm as mpm
 from benchmarks.accuracy.heat_fronts import between_surfaces, lag
@@ -254,9 +255,7 @@ def test_steps_that_are_too_long_for_a_front_are_reported(device):
         heat.check()
 
 
-@pytest.mark.parametrize("kind", [FixedSurface, Fixed])
-@pytest.mark.parametrize("lap", [0.0, 0.15])
-@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize(*in_pairs(kind=[FixedSurface, Fixed], lap=[0.0, 0.15], dim=[2, 3]))
 def test_a_floor_of_several_boxes_is_held_as_one(kind, lap, dim):
     """Their inner faces, and the edges of their seams, are no surfaces, in any order of the boxes."""
     dx = 0.1

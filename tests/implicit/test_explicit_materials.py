@@ -3,6 +3,7 @@
 import pytest
 import torch
 from helpers import relative_error
+from pairs import in_pairs
 
 import torch_mpm as mpm
 from benchmarks.catalogue.scenes import block
@@ -42,9 +43,14 @@ def momentum(state):
 # ---- accuracy
 
 
-@pytest.mark.parametrize("walls", [None, "sticky", "slip", "separate", "mirror", "rough"])
-@pytest.mark.parametrize("explicit", [SOLID, FLUID])
-@pytest.mark.parametrize("stress_form", ["mls", "gradient"])
+@pytest.mark.parametrize(
+    *in_pairs(
+        walls=[None, "sticky", "slip", "separate", "mirror", "rough"],
+        explicit=[SOLID, FLUID],
+        stress_form=["mls", "gradient"],
+        dim=[2, 3],
+    )
+)
 def test_a_short_step_is_an_explicit_one(dim, stress_form, explicit, walls, device):
     """The difference of one step is of second order in dt."""
     grid, state = beside(dim, device, corner=0.0 if walls else 0.5)

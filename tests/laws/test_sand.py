@@ -14,6 +14,7 @@ import pytest
 import torch
 from cases.matrices import deformation, rotations
 from oracle import sand as reference
+from pairs import in_pairs
 from torch import Tensor
 
 import torch_mpm as mpm
@@ -59,9 +60,11 @@ def error(value: Tensor, expected: Tensor) -> float:
 # ---- values
 
 
-@pytest.mark.parametrize(("energy", "apex", "flow"), FORMS)
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("shifted", [False, True])
+@pytest.mark.parametrize(
+    *in_pairs(
+        {("energy", "apex", "flow"): FORMS}, dtype=[torch.float32, torch.float64], shifted=[False, True], dim=[2, 3]
+    )
+)
 def test_return_map_is_the_reference(device, dim, energy, apex, flow, dtype, shifted):
     """`shifted`: with cohesion and the correction of lost volume."""
     F, mu, lam, angle = random_states(501 if flow == "exact" else 1001, dim)
