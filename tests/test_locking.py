@@ -6,7 +6,7 @@ import warnings
 
 import pytest
 import torch
-from helpers import run_quick
+from helpers import run_quick_here
 from pairs import in_pairs
 
 import torch_mpm as mpm
@@ -95,5 +95,5 @@ def test_commands_report_it_in_one_line(tmp_path):
 
 
 def test_the_study_runs(tmp_path):
-    run_quick("benchmarks.accuracy.locking", tmp_path)
+    run_quick_here("benchmarks.accuracy.locking", tmp_path)
     assert "| quadratic | default" in (tmp_path / "locking.md").read_text()

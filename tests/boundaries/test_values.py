@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from pairs import in_pairs
 from torch import Tensor
 
 import torch_mpm as mpm
@@ -73,7 +72,10 @@ def moved(way: str, value: Any) -> mpm.Obstacle:
     return ball
 
 
-@pytest.mark.parametrize(*in_pairs(way=WAYS, form=SCENES, scenes=[1, 2, 3], dim=[2, 3]))
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("form", SCENES)
+@pytest.mark.parametrize("scenes", [1, 2, 3])
+@pytest.mark.parametrize("dim", [2, 3])
 def test_positions_of_scenes(dim, scenes, form, way):
     """Also where there are as many scenes as components."""
     rows = [[1.0 + k, 10.0 + 3 * k, 7.0][-dim:] for k in range(scenes)]
