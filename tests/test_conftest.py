@@ -4,11 +4,13 @@ import itertools
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
-from pairs import in_pairs
+from pairs import each_once, in_pairs
 
 TESTS = Path(__file__).parent
 
@@ -56,15 +58,18 @@ def test_the_package_that_the_environment_names_is_tested(tmp_path: Path) -> Non
     assert done.returncode != 0 and "another build" in done.stdout + done.stderr
 
 
-def test_quick_cases_have_all_pairs_of_values() -> None:
-    axes = {"a": "uvwxyz", "b": range(5), "c": [True, False], "d": [None, 1.0, 2.0]}
-    names, cases = in_pairs(**axes)
-    assert names == tuple(axes) and [case.values for case in cases] == list(itertools.product(*axes.values()))
+AXES = {"a": "uvwxyz", "b": range(5), "c": [True, False], "d": [None, 1.0, 2.0]}
+
+
+@pytest.mark.parametrize(("product", "size", "most"), [(in_pairs, 2, 40), (each_once, 1, 6)])
+def test_quick_cases_have_all_values_or_pairs(product: Callable[..., Any], size: int, most: int) -> None:
+    names, cases = product(**AXES)
+    assert names == tuple(AXES) and [case.values for case in cases] == list(itertools.product(*AXES.values()))
     quick = [dict(zip(names, case.values, strict=True)) for case in cases if not case.marks]
-    assert len(quick) < len(cases) // 4
-    for one, other in itertools.combinations(names, 2):
-        met = {(case[one], case[other]) for case in quick}
-        assert met == set(itertools.product(axes[one], axes[other]))
+    assert len(quick) <= most
+    for some in itertools.combinations(names, size):
+        met = {tuple(case[name] for name in some) for case in quick}
+        assert met == set(itertools.product(*[AXES[name] for name in some]))
 
 
 @pytest.mark.parametrize("call", ["first", "second"])

@@ -492,9 +492,8 @@ def any_obstacles(count: int, dim: int, random: torch.Generator) -> list[Obstacl
     return found
 
 
-@pytest.mark.parametrize(
-    *in_pairs(dtype=[torch.float64, torch.float32], walls=[None, "separate", "mirror"], dim=[2, 3])
-)
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("walls", [None, "separate", "mirror"])
 def test_the_kernel_is_what_torch_operations_are(device, dim, dtype, walls):
     """For obstacles of all shapes, but for nodes where two surfaces are equally near to rounding."""
     if dim == 3 and (dtype == torch.float32 or walls == "separate"):

@@ -209,6 +209,9 @@ def test_bad_input():
         heat.check()
 
 
+@pytest.mark.thorough(place=0.0)
+@pytest.mark.thorough(place=0.25)
+@pytest.mark.thorough(place=0.5, transfer="flip")
 @pytest.mark.parametrize("place", [0.0, 0.13, 0.25, 0.5, 0.75])
 @pytest.mark.parametrize("per_cell,transfer,least,most", [(4, "hybrid", 0.0, 0.042), (1, "hybrid", 0.05, 0.23),
                                                           (4, "flip", 0.5, 1.2)])  # fmt: skip

@@ -349,7 +349,7 @@ def test_gradients_with_the_flow_inside(device):
 
 @pytest.mark.parametrize("solids", [1, 2])
 def test_gradcheck_of_a_step(solids, dim, device):
-    """Through v and the deformations of a fluid and one or two solids, of every entry of the results."""
+    """Through v and the deformations of a fluid and one or two solids, in random directions."""
     grid = mpm.Grid(0.5, (0.0,) * dim, (1.0,) * dim)
     state = block((0.25,) * dim, (0.75, 0.5, 0.5)[:dim], grid, device=device)
     eye = torch.eye(dim, dtype=torch.float64, device=device)
@@ -365,7 +365,7 @@ def test_gradcheck_of_a_step(solids, dim, device):
         return end.v, end.F, end.J
 
     leaves = [t.requires_grad_() for t in (v, F, J)]
-    assert torch.autograd.gradcheck(after, leaves, eps=1e-6, atol=1e-6, rtol=1e-6)
+    assert torch.autograd.gradcheck(after, leaves, eps=1e-6, atol=1e-6, rtol=1e-6, fast_mode=True)
 
 
 @pytest.mark.parametrize("checkpoint", [2, mpm.Checkpoints(states=2)], ids=["every second", "two states"])
