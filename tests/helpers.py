@@ -9,6 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
+from unittest import mock
 
 import torch
 from torch import Tensor
@@ -210,6 +211,18 @@ def run_quick(program: str, out: Path, *options: str) -> str:
     done = subprocess.run(command, cwd=common.ROOT, env=PASSIVE, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
+
+
+def run_quick_here(program: str, out: Path, *options: str) -> None:
+    """`run_quick` in this process and with its threads, without the imports of a new one."""
+    arguments = [program, "--quick", "--out", str(out), *options]
+    threads = mock.patch.object(common, "use_all_cores", torch.get_num_threads)
+    with mock.patch.object(sys, "argv", arguments), threads:
+        try:
+            status = importlib.import_module(program).main()
+        except SystemExit as end:
+            status = end.code
+    assert not status, status
 
 
 def result(out: Path, pattern: str) -> dict:

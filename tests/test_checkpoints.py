@@ -318,7 +318,12 @@ def test_an_estimate_of_a_rollout_in_one_op_is_what_the_allocator_gives(kept, de
 
 
 @pytest.mark.parametrize(
-    ("kept", "law"), [(2, "neo_hookean"), (mpm.Checkpoints(states=2), "von_mises"), (1, "von_mises")]
+    ("kept", "law"),
+    [
+        (2, "neo_hookean"),
+        pytest.param(mpm.Checkpoints(states=2), "von_mises", marks=pytest.mark.thorough),
+        pytest.param(1, "von_mises", marks=pytest.mark.thorough),
+    ],
 )
 def test_compiled_steps_that_were_never_called(kept, law, device):
     """Objects that a step creates and caches at its first call are no part of the recomputation."""

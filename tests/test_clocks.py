@@ -6,6 +6,7 @@ import io
 import numpy as np
 import pytest
 import torch
+from pairs import in_pairs
 from torch import Tensor
 
 import torch_mpm as mpm
@@ -115,9 +116,7 @@ TIMES = {
 }
 
 
-@pytest.mark.parametrize("time", TIMES)
-@pytest.mark.parametrize("form", FORMS)
-@pytest.mark.parametrize("way", WAYS, ids=lambda way: way.__name__)
+@pytest.mark.parametrize(*in_pairs(time=TIMES, form=FORMS, way=WAYS))
 @torch.no_grad()
 def test_time_is_the_sum_of_the_steps_and_obstacles_follow_it(way, form, time, device):
     """Against the same scene in float64 with numbers."""

@@ -14,7 +14,7 @@ from torch import Tensor
 
 import torch_mpm as mpm
 
-COUNT = int(os.environ.get("COMBINATIONS", "60"))
+COUNT, QUICK = int(os.environ.get("COMBINATIONS", "60")), 35
 FIELDS = ("x", "v", "C", "F", "J", "temperature")
 DIFFERENTIABLE = ("x", "v", "C", "F", "J", "mass", "volume", "temperature")
 
@@ -23,7 +23,9 @@ DRAWN = [draw(seed) for seed in range(COUNT)]
 
 def every(holds: Callable[[Combination], bool] = lambda c: True) -> pytest.MarkDecorator:
     """The combinations for which something holds."""
-    return pytest.mark.parametrize("c", [c for c in DRAWN if holds(c)], ids=lambda c: f"{c.seed}-{c.law}")
+    marks = [pytest.mark.thorough] if "COMBINATIONS" not in os.environ else []
+    cases = [pytest.param(c, marks=marks if c.seed >= QUICK else []) for c in DRAWN if holds(c)]
+    return pytest.mark.parametrize("c", cases, ids=lambda c: f"{c.seed}-{c.law}")
 
 
 def fields_of(state: mpm.State) -> dict[str, Tensor]:

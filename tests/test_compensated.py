@@ -5,6 +5,7 @@ import pickle
 import pytest
 import torch
 from helpers import relative_error
+from pairs import in_pairs
 
 import torch_mpm as mpm
 from benchmarks.catalogue.laws import named
@@ -62,9 +63,7 @@ WAYS = {
 }
 
 
-@pytest.mark.parametrize("offset", [0.0, 500.0])
-@pytest.mark.parametrize("dtype", [F32, F64])
-@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize(*in_pairs(offset=[0.0, 500.0], dtype=[F32, F64], way=WAYS, dim=[2, 3]))
 def test_slow_steel_moves(way, dtype, offset, dim, device):
     """By v t to 1e-3, and all of its kinetic energy is in that motion."""
     step, state = block(dim, dtype, offset, device)
@@ -79,9 +78,12 @@ def test_slow_steel_moves(way, dtype, offset, dim, device):
 
 
 @pytest.mark.parametrize(
-    "options", [{"integrator": "implicit"}, {"flip": 0.9}, {"stress_form": "gradient"}, {"transfer": "pic"}]
+    *in_pairs(
+        options=[{"integrator": "implicit"}, {"flip": 0.9}, {"stress_form": "gradient"}, {"transfer": "pic"}],
+        many=[False, True],
+        dim=[2, 3],
+    )
 )
-@pytest.mark.parametrize("many", [False, True])
 def test_slow_steel_moves_with_all_transfers(options, many, dim, device):
     step, state = block(dim, F32, 0.0, device, **options)
     end = mpm.rollout(step, state, 60, DT) if many else repeated(step, state, 60, DT)

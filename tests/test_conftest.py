@@ -1,11 +1,16 @@
-"""The test session itself: a GPU is tested, or the session reports why not."""
+"""The test session itself: a GPU is tested, or the session reports why not; threads, and which cases are quick."""
 
+import itertools
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
+import torch
+from pairs import each_once, in_pairs
 
 TESTS = Path(__file__).parent
 
@@ -51,3 +56,23 @@ def test_the_package_that_the_environment_names_is_tested(tmp_path: Path) -> Non
     (tmp_path / "torch_mpm" / "__init__.py").write_text("raise ImportError('another build')")
     done = session(PYTHONPATH=str(tmp_path), TORCH_MPM_CUDA="0")
     assert done.returncode != 0 and "another build" in done.stdout + done.stderr
+
+
+AXES = {"a": "uvwxyz", "b": range(5), "c": [True, False], "d": [None, 1.0, 2.0]}
+
+
+@pytest.mark.parametrize(("product", "size", "most"), [(in_pairs, 2, 40), (each_once, 1, 6)])
+def test_quick_cases_have_all_values_or_pairs(product: Callable[..., Any], size: int, most: int) -> None:
+    names, cases = product(**AXES)
+    assert names == tuple(AXES) and [case.values for case in cases] == list(itertools.product(*AXES.values()))
+    quick = [dict(zip(names, case.values, strict=True)) for case in cases if not case.marks]
+    assert len(quick) <= most
+    for some in itertools.combinations(names, size):
+        met = {tuple(case[name] for name in some) for case in quick}
+        assert met == set(itertools.product(*[AXES[name] for name in some]))
+
+
+@pytest.mark.parametrize("call", ["first", "second"])
+def test_threads_that_a_test_has_set_do_not_stay(call: str) -> None:
+    assert torch.get_num_threads() <= 2
+    torch.set_num_threads(3)

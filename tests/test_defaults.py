@@ -118,6 +118,8 @@ def usual(program: Callable[[int, str], list[Tensor]], dim: int, device: str) ->
     return program(dim, device)
 
 
+@pytest.mark.thorough(dim=3, default="context", program=simulate)
+@pytest.mark.thorough(dim=3, default="float16", program=simulate)
 @pytest.mark.parametrize("program", [simulate, conduct])
 def test_simulation(default, device, dim, program):
     expected = usual(program, dim, device)

@@ -7,6 +7,7 @@ from cases import few_particles as few
 from cases import many_particles as many
 from cases.rollouts import TRANSFERS, tensors
 from cases.small_scenes import F64, LAWS, assert_same, both, joined
+from pairs import in_pairs
 
 import torch_mpm as mpm
 
@@ -58,8 +59,7 @@ def test_many_particles(law, cells, dim, device):
     assert_repeats(step, state, many.N, many.dt_of(dim, device), 2e-2 if law == "sand" else 1e-3)
 
 
-@pytest.mark.parametrize("kernel", ["quadratic", "cubic"])
-@pytest.mark.parametrize("transfer", TRANSFERS)
+@pytest.mark.parametrize(*in_pairs(kernel=["quadratic", "cubic"], transfer=TRANSFERS, dim=[2, 3]))
 def test_a_mixture_beside_an_obstacle(transfer, kernel, dim, device):
     state = few.body(dim, device)
     material = (state.x[:, 0] > state.x[:, 0].mean()).int()

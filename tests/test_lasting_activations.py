@@ -4,6 +4,7 @@ import pytest
 import torch
 from cases.rollouts import LAWS_HERE, assert_equal, one_by_one, tensors
 from combinations import F64
+from pairs import in_pairs
 
 import torch_mpm as mpm
 from benchmarks.catalogue.scenes import blob, unit_box
@@ -20,9 +21,8 @@ def flow(dim, cells, count=2000, dtype=F64, **fields):
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("law", ["neo_hookean", "fluid", "sand", "viscoelastic"])
+@pytest.mark.parametrize(*in_pairs(law=["neo_hookean", "fluid", "sand", "viscoelastic"], cells=[0.01, 0.2], dim=[2, 3]))
 @pytest.mark.parametrize("options", [{"transfer": "pic"}, {"transfer": "apic"}, {"stress_form": "gradient"}], ids=str)
-@pytest.mark.parametrize("cells", [0.01, 0.2])
 def test_laws_and_forms(law, options, cells, dim):
     step = mpm.Step(unit_box(dim), LAWS_HERE[law](), walls="separate", **options)
     state = step.prepare(flow(dim, cells))

@@ -8,6 +8,7 @@ from cases.many_particles import N, body, cell, dt_of
 from cases.rollouts import LAWS_HERE, assert_equal, one_by_one
 from cases.small_scenes import F64, LAWS, assert_same, both
 from helpers import relative_error
+from pairs import in_pairs
 
 import torch_mpm as mpm
 
@@ -61,8 +62,7 @@ def test_a_jet(dim, device):
     assert_same(end, expected, 1e-2)
 
 
-@pytest.mark.parametrize("n", [3, 4, 5, 6, 17, 18])
-@pytest.mark.parametrize("flip", [0.0, 0.95])
+@pytest.mark.parametrize(*in_pairs(n=[3, 4, 5, 6, 17, 18], flip=[0.0, 0.95], dim=[2, 3]))
 def test_numbers_of_steps(n, flip, dim, device):
     step, single = make(dim, device, flip=flip), make(dim, device, flip=flip)
     end, expected = both(step, single, body(dim, device), n, dt_of(dim, device))

@@ -77,6 +77,7 @@ def test_only_code_of_the_avx_levels_uses_avx(functions: list[tuple[str, list[st
     assert [name for name in avx if not of_avx(name)] == []
 
 
+@pytest.mark.thorough
 def test_code_that_runs_at_load_uses_no_avx(functions: list[tuple[str, list[str]]]) -> None:
     """A processor without AVX-512 loads the library too: initialisers of its levels may not call their code."""
     names = "<_GLOBAL__sub_I_", "__static_initialization_and_destruction"

@@ -4,6 +4,7 @@ import pytest
 import torch
 from cases.rollout_gradients import assert_same, loss, moving
 from cases.rollouts import F64, LAWS_HERE, one_by_one
+from pairs import in_pairs
 from torch import Tensor
 
 import torch_mpm as mpm
@@ -31,10 +32,8 @@ def by_dt(step: mpm.Step, end: mpm.State, dt: Tensor) -> dict[str, Tensor | None
     return dict(zip(("dt", "gravity"), torch.autograd.grad(total, [dt, step.gravity]), strict=True))
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize(*in_pairs(law=LAWS, form=["mls", "gradient"], transfer=["apic", "pic"], dim=[2, 3]))
 @pytest.mark.parametrize("every", [1, 4, mpm.Checkpoints(memory=1e9)], ids=str)
-@pytest.mark.parametrize("form", ["mls", "gradient"])
-@pytest.mark.parametrize("transfer", ["apic", "pic"])
 def test_laws(law, every, form, transfer, dim, device):
     step, state = case(law, dim, device, stress_form=form, transfer=transfer)
     dt = torch.tensor(DT, dtype=F64, device=device, requires_grad=True)

@@ -31,6 +31,7 @@ from cases.rollouts import (
 from combinations import DT as CASE_DT
 from combinations import draw, make
 from helpers import TOLERANCE
+from pairs import in_pairs
 from torch import Tensor
 
 import torch_mpm as mpm
@@ -60,9 +61,8 @@ def test_random_simulations(seed, device):
     assert_same(got, expected, "rollout" if isinstance(case.step.law, mpm.Mixture) else "", reason)
 
 
-@pytest.mark.parametrize("law", LAWS_HERE)
+@pytest.mark.parametrize(*in_pairs(law=LAWS_HERE, transfer=SOME_TRANSFERS, dim=[2, 3]))
 @pytest.mark.parametrize("every", [1, 2, 7, ALL], ids=str)
-@pytest.mark.parametrize("transfer", SOME_TRANSFERS)
 def test_laws(law, every, transfer, dim, device):
     options = {"walls": "separate", **TRANSFERS[transfer]}
     step = mpm.Step(unit_box(dim), with_gradients(LAWS_HERE[law]()), pulled(dim), **options).to(device)
@@ -71,10 +71,15 @@ def test_laws(law, every, transfer, dim, device):
     assert_same(gradients(in_op(every), step, state), gradients(single(), step, state), tolerance)
 
 
-@pytest.mark.parametrize("transfer", TRANSFERS)
-@pytest.mark.parametrize("form", ["mls", "gradient"])
-@pytest.mark.parametrize("law", ["fluid", "neo_hookean"])
-@pytest.mark.parametrize("dtype", [torch.float32, F64])
+@pytest.mark.parametrize(
+    *in_pairs(
+        transfer=TRANSFERS,
+        form=["mls", "gradient"],
+        law=["fluid", "neo_hookean"],
+        dtype=[torch.float32, F64],
+        kernel=["quadratic", "cubic"],
+    )
+)
 def test_transfers(transfer, form, law, dtype, kernel, device):
     """Viscous laws read C without APIC too. With FLIP what the mass gives is a small difference of two transfers."""
     options = {"stress_form": form, "walls": "slip", **TRANSFERS[transfer]}
@@ -86,9 +91,7 @@ def test_transfers(transfer, form, law, dtype, kernel, device):
     assert_same(gradients(in_op(2), step, state), gradients(single(), step, state), tolerance)
 
 
-@pytest.mark.parametrize("transfer", TRANSFERS)
-@pytest.mark.parametrize("walls", WALLS)
-@pytest.mark.parametrize("n", [1, 40])
+@pytest.mark.parametrize(*in_pairs(transfer=TRANSFERS, walls=WALLS, n=[1, 40], dim=[2, 3]))
 def test_walls(transfer, walls, n, dim, device):
     options = {"walls": touched(walls, dim), **TRANSFERS[transfer]}
     step = mpm.Step(unit_box(dim), with_gradients(mpm.NeoHookean(E=1e4, nu=0.3)), pulled(dim), **options).to(device)
@@ -130,7 +133,7 @@ def batch(dim: int, device: str, transfer: str = "apic") -> tuple[mpm.Step, mpm.
 
 
 @pytest.mark.parametrize("every", [None, 2, ALL], ids=str)
-@pytest.mark.parametrize("transfer", TRANSFERS)
+@pytest.mark.parametrize(*in_pairs(transfer=TRANSFERS, dim=[2, 3]))
 def test_batches_with_obstacles_and_parameters_of_scenes_and_particles(every, transfer, dim, device):
     step, state = batch(dim, device, transfer)
     expected = gradients(single(), step, state)

@@ -6,6 +6,7 @@ import pytest
 import torch
 from cases.rollout_gradients import assert_same, gradients, in_op, moving, single, with_gradients
 from cases.rollouts import LAWS_HERE, SOME_TRANSFERS, TRANSFERS, assert_equal, in_one_op, one_by_one
+from pairs import in_pairs
 from torch import Tensor
 
 import torch_mpm as mpm
@@ -29,10 +30,9 @@ def flexed(state: mpm.State, most: float = 3e3) -> mpm.State:
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("law", SOLIDS)
-@pytest.mark.parametrize("n", [1, 2, 17])
-@pytest.mark.parametrize("transfer", SOME_TRANSFERS)
-@pytest.mark.parametrize("dtype", [torch.float32, F64])
+@pytest.mark.parametrize(
+    *in_pairs(law=SOLIDS, n=[1, 2, 17], transfer=SOME_TRANSFERS, dtype=[torch.float32, F64], dim=[2, 3])
+)
 def test_muscles(law, n, transfer, dtype, dim, device):
     muscle = mpm.Active(LAWS_HERE[law](), fibres(dim, device, dtype=dtype))
     step = mpm.Step(unit_box(dim), muscle, gravity=(0.0, -9.8, 0.0)[:dim], walls="separate", **TRANSFERS[transfer])

@@ -9,6 +9,7 @@ import torch
 from cases.rollout_gradients import assert_same, gradients, in_op, moving, single
 from cases.rollouts import SOME_TRANSFERS, TRANSFERS, assert_equal, in_one_op, one_by_one
 from helpers import TOLERANCE
+from pairs import in_pairs
 from torch import Tensor
 
 import torch_mpm as mpm
@@ -58,12 +59,16 @@ def bodies(dim: int, path, **options) -> list[mpm.boundaries.Obstacle]:
     ]
 
 
-@pytest.mark.parametrize("path", PATHS)
-@pytest.mark.parametrize(("n", "dtype"), [(1, F64), (2, torch.float32), (5, F64), (17, torch.float32)])
-@pytest.mark.parametrize("transfer", SOME_TRANSFERS)
-def test_paths(path, n, transfer, dtype, dim, device):
-    if n == 17 and path != "smooth" and transfer != "apic":
-        pytest.skip("fewer steps have it")
+@pytest.mark.parametrize(
+    *in_pairs(
+        path=PATHS,
+        steps=[(1, F64), (2, torch.float32), (5, F64), (17, torch.float32)],
+        transfer=SOME_TRANSFERS,
+        dim=[2, 3],
+    )
+)
+def test_paths(path, steps, transfer, dim, device):
+    n, dtype = steps
     state = blob(device, dim, dtype=dtype)
     obstacles = bodies(dim, PATHS[path](dim, device))
     step = mpm.Step(unit_box(dim), mpm.NeoHookean(E=1e4, nu=0.3), boundaries=obstacles, **TRANSFERS[transfer]).to(
@@ -78,8 +83,7 @@ def test_paths(path, n, transfer, dtype, dim, device):
     assert float((end.v - free.v).abs().max()) > 0.1
 
 
-@pytest.mark.parametrize("scenes", [1, 3])
-@pytest.mark.parametrize("n", [6, 17])
+@pytest.mark.parametrize(*in_pairs(scenes=[1, 3], n=[6, 17], dim=[2, 3]))
 def test_paths_of_scenes_with_clocks_of_their_own(scenes, n, dim, device):
     state = blob(device, dim, scene=torch.arange(300, dtype=torch.int32) % scenes)
     state = state.replace(scene=state.scene.int(), time=1e-4 * torch.arange(scenes, dtype=F64, device=device))
@@ -320,7 +324,7 @@ def test_gradients_of_obstacles_of_scenes(with_impulse, dim, device):
     assert_same(gradients(in_op(2), step, state), gradients(single(), step, state))
 
 
-@pytest.mark.parametrize("path", ["waypoints", "function"])
+@pytest.mark.parametrize(*in_pairs(path=["waypoints", "function"], dim=[2, 3]))
 @pytest.mark.parametrize("every", [2, mpm.Checkpoints(memory=1e9)], ids=str)
 def test_gradients_of_paths(path, every, dim, device):
     """Control points as parameters of a module, and a tensor that a function reads, which no module has."""

@@ -18,6 +18,7 @@ from cases.rollouts import (
 )
 from combinations import DT, F64, draw, make
 from helpers import TOLERANCE, OpNames
+from pairs import in_pairs
 from torch import Tensor
 
 import torch_mpm as mpm
@@ -45,10 +46,9 @@ def test_random_simulations_are_taken_in_one_op(device):
         assert sum(in_one_op(case.step, case.state) for case in cases) > len(cases) / 3
 
 
-@pytest.mark.parametrize("law", LAWS_HERE)
-@pytest.mark.parametrize("n", [1, 2, 5, 15])
-@pytest.mark.parametrize("transfer", SOME_TRANSFERS)
-@pytest.mark.parametrize("dtype", [torch.float32, F64])
+@pytest.mark.parametrize(
+    *in_pairs(law=LAWS_HERE, n=[1, 2, 5, 15], transfer=SOME_TRANSFERS, dtype=[torch.float32, F64], dim=[2, 3])
+)
 def test_laws(law, n, transfer, dim, dtype, device):
     """On CUDA the law of a step in float32 is part of P2G, and from 14 steps on some are replayed."""
     options = {"gravity": (0.0, -9.8, 0.0)[:dim], "walls": "separate", **TRANSFERS[transfer]}
@@ -65,11 +65,15 @@ def test_laws(law, n, transfer, dim, dtype, device):
             assert float((value[5] - tensors(expected)[name][5]).abs().max()) <= float(rounding), name
 
 
-@pytest.mark.parametrize("transfer", TRANSFERS)
-@pytest.mark.parametrize("form", ["mls", "gradient"])
-@pytest.mark.parametrize("kernel", ["quadratic", "cubic"])
-@pytest.mark.parametrize("walls", WALLS)
-@pytest.mark.parametrize("dtype", [torch.float32, F64])
+@pytest.mark.parametrize(
+    *in_pairs(
+        transfer=TRANSFERS,
+        form=["mls", "gradient"],
+        kernel=["quadratic", "cubic"],
+        walls=WALLS,
+        dtype=[torch.float32, F64],
+    )
+)
 def test_transfers(transfer, form, kernel, walls, dtype, device):
     options = {"stress_form": form, "walls": touched(walls, 3), **TRANSFERS[transfer]}
     step = mpm.Step(unit_box(kernel=kernel), mpm.NeoHookean(E=1e4, nu=0.3), (0.0, -9.8, 0.0), **options)
@@ -79,11 +83,16 @@ def test_transfers(transfer, form, kernel, walls, dtype, device):
         assert_equal(mpm.rollout(step, state, 4, 1e-4), one_by_one(step, state, 4, 1e-4))
 
 
-@pytest.mark.parametrize("cells", [0.003, 0.06, 1.6])
-@pytest.mark.parametrize("kernel", ["quadratic", "cubic"])
-@pytest.mark.parametrize("shuffled", [False, True])
-@pytest.mark.parametrize("transfer", SOME_TRANSFERS)
-@pytest.mark.parametrize("dtype", [torch.float32, F64])
+@pytest.mark.parametrize(
+    *in_pairs(
+        cells=[0.003, 0.06, 1.6],
+        kernel=["quadratic", "cubic"],
+        shuffled=[False, True],
+        transfer=SOME_TRANSFERS,
+        dtype=[torch.float32, F64],
+        dim=[2, 3],
+    )
+)
 def test_particles_leave_the_blocks_they_were_found_in(dim, device, cells, kernel, shuffled, transfer, dtype):
     """`cells` per step at which a cloud moves and parts: some stay in the blocks of the first step, some go to others
     that are active, or to others yet. On CUDA blocks are not found anew in every step."""
@@ -138,8 +147,7 @@ def test_particles_that_flow_through_many_blocks(transfer, dim, device):
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("law", ["neo_hookean", "sand", "mixture"])
-@pytest.mark.parametrize("transfer", SOME_TRANSFERS)
+@pytest.mark.parametrize(*in_pairs(law=["neo_hookean", "sand", "mixture"], transfer=SOME_TRANSFERS, dim=[2, 3]))
 def test_threads_change_nothing(dim, law, transfer):
     if law == "mixture":
         step, state = streams(dim, "cpu", transfer)

@@ -4,6 +4,7 @@ import pytest
 import torch
 from helpers import TOLERANCE, relative_error
 from oracle import advance, contact, grid_update, material, sand, transfer
+from pairs import in_pairs
 from torch import Tensor
 
 import torch_mpm as mpm
@@ -67,10 +68,15 @@ def one_step(step: mpm.Step, law: str, state: dict[str, Tensor], rest: mpm.State
     return dict(zip(("x", "v", "C", "F", "J"), moved, strict=True))
 
 
-@pytest.mark.parametrize("law", ["solid", "sand", "fluid"])
-@pytest.mark.parametrize("transfer_", ["apic", "pic"])
-@pytest.mark.parametrize("form", ["mls", "gradient"])
-@pytest.mark.parametrize(("walls", "touching"), [("separate", True), ("sticky", False), ("mirror", True)])
+@pytest.mark.parametrize(
+    *in_pairs(
+        {("walls", "touching"): [("separate", True), ("sticky", False), ("mirror", True)]},
+        law=["solid", "sand", "fluid"],
+        transfer_=["apic", "pic"],
+        form=["mls", "gradient"],
+        dim=[2, 3],
+    )
+)
 def test_a_rollout_is_that_of_plain_torch(law, transfer_, form, walls, touching, dim, device):
     grid = mpm.Grid(dx=0.1, lower=(0.0,) * dim, upper=(1.0,) * dim)
     center, velocity = (CENTER,) * dim, (SPEED,) + (0.0,) * (dim - 1)

@@ -7,6 +7,7 @@ import pytest
 import torch
 from cases.small_scenes import DT, F32, LAWS, N, assert_same, both, joined
 from helpers import relative_error
+from pairs import in_pairs
 
 import torch_mpm as mpm
 from benchmarks.catalogue.scenes import block_state
@@ -18,9 +19,7 @@ def make(dim, scenes, law, dx=0.1, **options):
     return mpm.Step(grid, LAWS[law](), gravity=(0.0, -9.8) + (0.0,) * (dim - 2), walls="separate", **options)
 
 
-@pytest.mark.parametrize("deterministic", [False, True])
-@pytest.mark.parametrize("law", LAWS)
-@pytest.mark.parametrize("flip", [0.0, 0.95])
+@pytest.mark.parametrize(*in_pairs(deterministic=[False, True], law=LAWS, flip=[0.0, 0.95], dim=[2, 3]))
 def test_scenes_of_several_sizes(law, flip, dim, deterministic, device):
     lows = (0.3, 0.5, None, 0.2, 0.59)
     blocks = [low and block_state(dim, low=low, high=low + 0.15 + 0.1 * (k % 2)) for k, low in enumerate(lows)]

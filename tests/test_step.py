@@ -5,6 +5,7 @@ import torch
 from helpers import TOLERANCE, random_particles, relative_error
 from oracle import grid_update as grid_reference
 from oracle import transfer as reference
+from pairs import in_pairs
 
 import torch_mpm as mpm
 from benchmarks.catalogue.scenes import block_state, make_step
@@ -86,7 +87,7 @@ def test_free_fall_is_exact(device, dim):
 
 
 @pytest.mark.parametrize("options", [{"transfer": "flip"}, {"flip": 0.95}, {"transfer": "pic", "flip": 0.5}], ids=str)
-@pytest.mark.parametrize("walls", [None, "sticky", "mirror"])
+@pytest.mark.parametrize(*in_pairs(walls=[None, "sticky", "mirror"], dim=[2, 3], kernel=["quadratic", "cubic"]))
 def test_flip_is_the_reference(device, dim, kernel, options, walls):
     """(1 − flip) v_pic + flip (v + Σ N_i (v_i − v_i before the forces)); a mirror acts on both v_i."""
     gravity, dt = torch.linspace(-9.8, 1.0, dim, dtype=torch.float64, device=device), 1e-3

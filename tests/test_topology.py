@@ -8,6 +8,7 @@ import sys
 import pytest
 import torch
 from helpers import random_particles
+from pairs import in_pairs
 
 import torch_mpm as mpm
 from torch_mpm.grid.topology import Topology
@@ -109,8 +110,7 @@ def wide_blocks(blocks: mpm.Blocks) -> torch.Tensor:
     return torch.where(blocks.block[:, None] >= 0, torch.stack([index, *columns], 1), -1)
 
 
-@pytest.mark.parametrize("scenes", [1, 3])
-@pytest.mark.parametrize("room", [4000, 6])
+@pytest.mark.parametrize(*in_pairs(scenes=[1, 3], room=[4000, 6], dim=[2, 3], kernel=["quadratic", "cubic"]))
 def test_a_large_domain_has_the_blocks_of_a_small_one(dim, kernel, scenes, room):
     """In the same slots, also where there is no room for all; activations do not see each other's tables."""
     state = drops(dim, scenes)
@@ -130,8 +130,7 @@ def test_a_large_domain_has_the_blocks_of_a_small_one(dim, kernel, scenes, room)
         blocks.table.fill_(3)  # its own
 
 
-@pytest.mark.parametrize("scenes", [1, 3])
-@pytest.mark.parametrize("deterministic", [False, True])
+@pytest.mark.parametrize(*in_pairs(scenes=[1, 3], deterministic=[False, True], dim=[2, 3]))
 def test_a_large_domain_moves_as_a_small_one(dim, scenes, deterministic):
     """Bit by bit, while particles go from block to block, in one op, step by step, and with gradients."""
     state = drops(dim, scenes)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers import result, run_quick
+from helpers import result, run_quick, run_quick_here
 
 from benchmarks import common, report
 from benchmarks.accuracy import convergence, manufactured, ritter
@@ -119,7 +119,7 @@ def test_richardson() -> None:
 
 
 def test_limits_program(tmp_path: Path) -> None:
-    run_quick("benchmarks.accuracy.limits", tmp_path)
+    run_quick_here("benchmarks.accuracy.limits", tmp_path)
     found = result(tmp_path, "limits.json")
     for row in found["spins"]:
         assert row["momentum"] < 1e-13
@@ -202,7 +202,7 @@ def test_return_map_of_sand_against_extended_precision(tmp_path: Path) -> None:
 
 
 def test_gradients_of_sand_program(tmp_path: Path) -> None:
-    run_quick("benchmarks.accuracy.sand_gradient", tmp_path)
+    run_quick_here("benchmarks.accuracy.sand_gradient", tmp_path)
     found = result(tmp_path, "sand_gradient.json")
     for row in found["rows"]:
         assert row["at rest"] < found["allowed"]
@@ -220,7 +220,7 @@ def test_no_law_is_unstable_below_its_estimate(tmp_path: Path) -> None:
 
 
 def test_random_rollouts_program(tmp_path: Path) -> None:
-    run_quick("benchmarks.stability.adversarial", tmp_path)
+    run_quick_here("benchmarks.stability.adversarial", tmp_path)
     found = result(tmp_path, "adversarial.json")
     assert len(found["rollouts"]["motion"]) == 10
     assert not any(row["inverted"] or row["flattened"] or row["not finite"] for row in found["rows"])
@@ -236,7 +236,7 @@ def test_data_sets_program(tmp_path: Path) -> None:
 
 
 def test_svd_program(tmp_path: Path) -> None:
-    run_quick("benchmarks.accuracy.svd", tmp_path)
+    run_quick_here("benchmarks.accuracy.svd", tmp_path)
     for row in result(tmp_path, "svd_accuracy.json")["rows"]:
         assert row["errors"]["svd3"]["product"][1] < 1e-6
 

@@ -13,10 +13,17 @@ for package in ("h5py", "imageio_ffmpeg", "isal", "matplotlib", "meshio", "pydan
     pytest.importorskip(package)
 
 
-SHORT, LONG = ("run", "generate"), ("run", "generate", "export", "render")
+ALL = ("run", "generate", "export", "render")
 
 
-@pytest.mark.parametrize(("commands", "count"), [(SHORT, 1), pytest.param(LONG, 100, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("commands", "count"),
+    [
+        (("run",), 1),
+        pytest.param(("generate",), 1, marks=pytest.mark.thorough),
+        pytest.param(ALL, 100, marks=pytest.mark.slow),
+    ],
+)
 def test_nothing_is_lost_and_nothing_is_left(tmp_path, commands, count):
     counts = ["--kills", str(count), "--signals", str(count), "--commands", *commands]
     command = [sys.executable, "-m", "benchmarks.fuzz.interruptions", *counts, "--out", str(tmp_path), "--seed", "1"]

@@ -12,10 +12,16 @@ pytest.importorskip("h5py")
 pytest.importorskip("pydantic")
 
 
-def test_nothing_crashes_lies_or_loses_a_frame(tmp_path):
+FEW = {"mutations": 3, "kills": 1, "disks": 1, "corrupt": 1}
+SHORT = {"mutations": 8, "kills": 1, "disks": 1, "corrupt": 3}
+
+
+@pytest.mark.parametrize(
+    "counts", [pytest.param(FEW, id="few"), pytest.param(SHORT, id="short", marks=pytest.mark.thorough)]
+)
+def test_nothing_crashes_lies_or_loses_a_frame(tmp_path, counts):
     for package in ("matplotlib", "meshio", "trimesh"):
         pytest.importorskip(package)
-    counts = {"mutations": 8, "kills": 1, "disks": 1, "corrupt": 3}
     options = [word for part, count in counts.items() for word in (f"--{part}", str(count))]
     command = [sys.executable, "-m", "benchmarks.fuzz.runs", "--seed", "1", "--out", str(tmp_path), *options]
     done = subprocess.run(command, cwd=common.ROOT, capture_output=True, text=True)

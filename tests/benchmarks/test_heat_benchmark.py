@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers import random_particles, result, run_quick
+from helpers import random_particles, result, run_quick, run_quick_here
 from oracle.heat import HeatOperator
 
 from benchmarks import report
@@ -36,7 +36,7 @@ def test_heat_benchmark(tmp_path: Path) -> None:
 def test_fronts_and_held_surfaces(tmp_path: Path) -> None:
     assert abs(root(1.0, 0.0) - 0.6200626) < 1e-6 and abs(root(0.1, 0.0) - 0.2200163) < 1e-6
     assert abs(root(1.7, -0.4) - 0.5625) < 1e-4
-    run_quick("benchmarks.accuracy.heat_fronts", tmp_path)
+    run_quick_here("benchmarks.accuracy.heat_fronts", tmp_path)
     found = result(tmp_path, "heat_fronts.json")
     assert all(0 < row["lengths"] < 0.5 for row in found["fronts"])
     assert all(row["most"] < 0.05 for row in found["surfaces"])

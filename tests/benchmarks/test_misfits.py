@@ -39,9 +39,10 @@ def found(count: int, seed: int, place: Path) -> list[list[Any]]:
     return results
 
 
-def test_what_does_not_fit_is_refused_by_name(tmp_path: Path) -> None:
-    results = found(600, 0, tmp_path)
-    assert len(results) == 600
+@pytest.mark.parametrize("count", [150, pytest.param(600, marks=pytest.mark.thorough)])
+def test_what_does_not_fit_is_refused_by_name(count: int, tmp_path: Path) -> None:
+    results = found(count, 0, tmp_path)
+    assert len(results) == count
     assert [result for result in results if result[4] in misfits.FAULTS] == []
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers import result, run_quick
+from helpers import result, run_quick_here
 
 from benchmarks import common, regressions
 from benchmarks.speed import heat, laws, rollouts, step, svd
@@ -52,7 +52,9 @@ def test_rows_of_the_committed_results_have_names_of_their_own(pattern: str, pro
         assert all(time > 0 for _, time in rows)
 
 
-@pytest.mark.parametrize(("program", "module"), [("laws", laws), ("rollouts", rollouts)])
+@pytest.mark.parametrize(
+    ("program", "module"), [("laws", laws), pytest.param("rollouts", rollouts, marks=pytest.mark.thorough)]
+)
 def test_program_writes_what_it_compares(program: str, module: Any, tmp_path: Path) -> None:
-    run_quick(f"benchmarks.speed.{program}", tmp_path)
+    run_quick_here(f"benchmarks.speed.{program}", tmp_path)
     assert dict(module.timed(result(tmp_path, f"{program}_*.json")))

@@ -6,6 +6,7 @@ import textwrap
 import numpy as np
 import pytest
 import torch
+from pairs import in_pairs
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -135,9 +136,7 @@ def test_a_node_on_the_surface_counts(dim, device):
 # ---- contact
 
 
-@pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("kind", ["slip", "separate"])
-@pytest.mark.parametrize("friction", [0.0, 0.3])
+@pytest.mark.parametrize(*in_pairs(shape=SHAPES, kind=["slip", "separate"], friction=[0.0, 0.3], dim=[2, 3]))
 def test_coulomb_friction_in_the_frame_of_the_surface(dim, device, shape, kind, friction):
     motion = {"velocity": numbers(dim, 0.7, -0.4, 0.2), "angular_velocity": SPIN[dim], "rotation": ANGLE[dim]}
     obstacle = shapes(dim, kind=kind, friction=friction, **motion)[SHAPES.index(shape)]

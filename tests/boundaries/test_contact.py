@@ -6,6 +6,7 @@ import pytest
 import torch
 from helpers import random_blocks
 from oracle.contact import contact_velocity
+from pairs import in_pairs
 from torch import Tensor
 
 import torch_mpm as mpm
@@ -78,9 +79,7 @@ def moving(dim: int) -> dict[str, object]:
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("shape", NAMES)
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("friction", [0.0, 0.4])
+@pytest.mark.parametrize(*in_pairs(shape=NAMES, kind=KINDS, friction=[0.0, 0.4], dim=[2, 3]))
 def test_is_the_contact_of_the_obstacle(device, dim, shape, kind, friction):
     blocks, velocity = inputs(dim, device)
     for motion in ({}, moving(dim)):

@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import functools
 import gc
 import pickle
 from collections.abc import Callable
@@ -152,15 +153,20 @@ WAYS = {
 }  # fmt: skip
 
 
+@functools.cache
+def on_the_path(dim: int, device: str) -> mpm.State:
+    poses = [at(k, dim, device) for k in range(4)]
+    path = along([start(dim, device), *poses])
+    return mpm.rollout(step_with(box(path, dim), dim), block(dim, device), N * len(poses), DT)
+
+
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("dim", [2, 3])
 def test_assigned_positions_push_as_a_path_does(way, dim, device):
     poses = [at(k, dim, device) for k in range(4)]
     paddle = box(start(dim, device), dim)
     end = WAYS[way](step_with(paddle, dim), paddle, block(dim, device), poses)
-    path = along([start(dim, device), *poses])
-    expected = mpm.rollout(step_with(box(path, dim), dim), block(dim, device), N * len(poses), DT)
-    assert_alike(end, expected)
+    assert_alike(end, on_the_path(dim, device))
     assert float(end.v[:, 0].mean()) > 0.5
 
 
@@ -216,26 +222,27 @@ PATHS = {
 }
 
 
+def block_pushed(run: str, device: str, position: Any, **motion: Any) -> mpm.State:
+    """The block after 18 steps; the paddle acts by torch operations if `run` says so."""
+    form = box if run != "torch operations" else functools.partial(mpm.SDF, shapes.Box((0.1, 0.6)).signed_distance)
+    step, state = step_with(form(position, **motion)), block(device=device)
+    if run != "steps":
+        return mpm.rollout(step, state, 18, 2 * DT)
+    for _ in range(18):
+        state = step(state, 2 * DT)
+    return state
+
+
+@functools.cache
+def block_at_constant_speed(run: str, device: str) -> mpm.State:
+    return block_pushed(run, device, (0.35, 0.25), velocity=(V, 0.0))
+
+
 @pytest.mark.parametrize("run", ["rollout", "steps", "torch operations"])
 @pytest.mark.parametrize("path", PATHS)
 def test_paths_without_a_derivative_are_differenced(path, run, device):
-    n = 35
-    form = (lambda p: p) if path != "tensor of numbers" else (lambda p: lambda t: p(t).to(t.device))
-    position = form(PATHS[path])
-    paddle = box(position) if run != "torch operations" else mpm.SDF(shapes.Box((0.1, 0.6)).signed_distance, position)
-    reference = box((0.35, 0.25), velocity=(V, 0.0))
-    if run == "torch operations":
-        reference = mpm.SDF(shapes.Box((0.1, 0.6)).signed_distance, (0.35, 0.25), velocity=(V, 0.0))
-    ends = []
-    for boundary in (paddle, reference):
-        step, state = step_with(boundary), block(device=device)
-        if run == "steps":
-            for _ in range(n):
-                state = step(state, DT)
-        else:
-            state = mpm.rollout(step, state, n, DT)
-        ends.append(state)
-    assert_alike(*ends, 1e-8)
+    position = PATHS[path] if path != "tensor of numbers" else lambda t: PATHS[path](t).to(t.device)
+    assert_alike(block_pushed(run, device, position), block_at_constant_speed(run, device), 1e-8)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
@@ -270,6 +277,29 @@ ONE_TIME = {
 }
 
 
+def scenes_pushed(run: str, scenes: int, device: str, position: Any, **motion: Any) -> mpm.State:
+    """Blocks in scenes with times of their own; the paddle acts by torch operations if `run` says so."""
+    dt = 2 * DT * torch.arange(1, scenes + 1, dtype=F64, device=device)
+    paddle = box(position, **motion)
+    if run == "torch operations":
+        paddle = mpm.SDF(shapes.Box((0.1, 0.6)).signed_distance, position, **motion)
+    step = step_with(paddle, scenes=scenes)
+    state = mpm.State.concatenate([block(device=device)] * scenes, scene=True)
+    if run == "to":
+        return mpm.rollout_to(step, state, 20 * dt, longest=2e-3).state
+    if run == "rollout":
+        return mpm.rollout(step, state, 30, dt)
+    state = state.replace(time=torch.zeros(scenes, dtype=F64, device=device))
+    for _ in range(20):
+        state = step(state, dt)
+    return state
+
+
+@functools.cache
+def scenes_at_constant_speed(run: str, scenes: int, device: str) -> mpm.State:
+    return scenes_pushed(run, scenes, device, (0.35, 0.25), velocity=(V, 0.0))
+
+
 @pytest.mark.thorough(scenes=3)
 @pytest.mark.parametrize(
     ("run", "scenes"), [("rollout", 2), ("rollout", 3), ("steps", 1), ("steps", 2), ("to", 3), ("torch operations", 2)]
@@ -277,26 +307,9 @@ ONE_TIME = {
 @pytest.mark.parametrize("path", ONE_TIME)
 def test_paths_of_one_time_serve_scenes_with_times_of_their_own(path, scenes, run, device):
     """Whatever the number of scenes is, also that of the dimensions."""
-    dt = DT * torch.arange(1, scenes + 1, dtype=F64, device=device)
-
-    def end(**motion: Any) -> mpm.State:
-        paddle = box(motion.pop("position", (0.35, 0.25)), **motion)
-        if run == "torch operations":
-            paddle = mpm.boundaries.Obstacle(
-                mpm.shapes.SDF(mpm.shapes.Box((0.1, 0.6)).signed_distance), paddle.position, velocity=paddle.velocity
-            )
-        step = step_with(paddle, scenes=scenes)
-        state = mpm.State.concatenate([block(device=device)] * scenes, scene=True)
-        if run == "to":
-            return mpm.rollout_to(step, state, 40 * dt, longest=1e-3).state
-        if run == "rollout":
-            return mpm.rollout(step, state, 60, dt)
-        state = state.replace(time=torch.zeros(scenes, dtype=F64, device=device))
-        for _ in range(40):
-            state = step(state, dt)
-        return state
-
-    assert_alike(end(position=ONE_TIME[path]), end(velocity=(V, 0.0)), 1e-6)
+    assert_alike(
+        scenes_pushed(run, scenes, device, ONE_TIME[path]), scenes_at_constant_speed(run, scenes, device), 1e-6
+    )
 
 
 def test_paths_with_rows_of_scenes(device):

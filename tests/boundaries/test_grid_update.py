@@ -7,6 +7,7 @@ import pytest
 import torch
 from helpers import random_blocks, random_nodes, relative_error
 from oracle.grid_update import grid_update as reference
+from pairs import in_pairs
 from torch import Tensor
 
 import torch_mpm as mpm
@@ -54,8 +55,7 @@ def assert_close(value: Tensor, expected: Tensor, tolerance: float) -> None:
 # ---- values
 
 
-@pytest.mark.parametrize("name", WALLS)
-@pytest.mark.parametrize("scenes", [1, 3])
+@pytest.mark.parametrize(*in_pairs(name=WALLS, scenes=[1, 3], dim=[2, 3]))
 def test_velocity_is_the_reference(device, dim, name, scenes):
     blocks, nodes, gravity, dt = inputs(dim, device, scenes)
     walls = walls_named(name, dim)

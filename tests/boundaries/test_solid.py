@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import torch
 from helpers import random_blocks
+from pairs import in_pairs
 from torch import Tensor
 
 import torch_mpm as mpm
@@ -530,8 +531,9 @@ def test_impulses_of_corners_add_up_to_the_change_of_momentum(device, dim, kind)
 # ---- implicit steps
 
 
-@pytest.mark.parametrize("form", ["floor under walls", "planes", "own shape"])
-@pytest.mark.parametrize("kind", ["separate", "sticky"])
+@pytest.mark.parametrize(
+    *in_pairs(form=["floor under walls", "planes", "own shape"], kind=["separate", "sticky"], dim=[2, 3])
+)
 def test_implicit_bounds_behind_a_corner_are_those_of_all_its_faces(device, dim, form, kind):
     blocks, velocity = nodes(dim, device)
     tested, expected = expected_in_tank(blocks, velocity, kind)

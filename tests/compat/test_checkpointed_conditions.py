@@ -1,5 +1,7 @@
 """Timed conditions of MPM-PyTorch's solver in calls that `torch.utils.checkpoint` recomputes."""
 
+import functools
+
 import pytest
 import torch
 from torch.utils.checkpoint import checkpoint
@@ -72,16 +74,20 @@ def made(condition, device):
     return solver
 
 
+@functools.cache
+def usual(name, device):
+    """Gradients without checkpoints, and the time at the end."""
+    solver = made(CONDITIONS.get(name), device)
+    return gradients(solver, plain, 1, device), solver.time
+
+
 @pytest.mark.parametrize(
     ("kept", "calls"),
     [("reentrant", 1), ("reentrant", 4), ("not reentrant", 1), ("not reentrant", 4), ("with pools", 1)],
 )
 @pytest.mark.parametrize("name", CONDITIONS)
 def test_gradients_are_those_without_checkpoints(name, kept, calls, device):
-    solver = made(CONDITIONS[name], device)
-    expected = gradients(solver, plain, 1, device)
-    time = solver.time
-    without = gradients(made(None, device), plain, 1, device)
+    (expected, time), (without, _) = usual(name, device), usual(None, device)
     assert not all(torch.equal(a, b) for a, b in zip(expected, without, strict=True)), "the condition must act"
     again = made(CONDITIONS[name], device)
     found = gradients(again, CHECKPOINTS[kept], calls, device)

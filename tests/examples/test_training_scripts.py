@@ -37,6 +37,7 @@ def test_stiffness_field_is_recovered(device, tmp_path, capsys):
     assert drawn(tmp_path / "recover_stiffness_field.png")
 
 
+@pytest.mark.thorough
 def test_law_is_learnt(device, tmp_path, capsys):
     """Before training, the ring is off by 10% of its diameter in so short a time."""
     assert example("learn_law").main(tmp_path, device, iterations=12, steps=60) < 0.05
@@ -52,6 +53,7 @@ def test_learnt_law_has_an_energy():
     torch.testing.assert_close(network(F), by_F @ F.mT)
 
 
+@pytest.mark.thorough
 def test_walker_learns(device, tmp_path, capsys):
     """Before training it comes 5 mm far in a second."""
     pytest.importorskip("imageio_ffmpeg")
@@ -59,6 +61,7 @@ def test_walker_learns(device, tmp_path, capsys):
     assert drawn(tmp_path / "walker.png") and (tmp_path / "walker.mp4").stat().st_size > 1000
 
 
+@pytest.mark.thorough
 def test_friction_is_learnt(device, tmp_path, capsys):
     """No constant coefficient comes nearer than 27%."""
     assert example("learn_friction").main(tmp_path, device, iterations=6, steps=150) < 0.1

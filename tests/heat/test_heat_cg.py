@@ -8,6 +8,7 @@ import torch
 from cases.heat_cg import check_replay, dense_increment, dense_operator, heat, op_arguments
 from helpers import TOLERANCE, relative_error
 from oracle import heat as reference
+from pairs import in_pairs
 from torch import Tensor
 
 import torch_mpm as mpm
@@ -158,8 +159,14 @@ def test_tolerance_bounds_the_error(dim, kernel):
         assert solve.converged.all() and (error <= tolerance).all()
 
 
-@pytest.mark.parametrize("method", ["cg", "chebyshev", "multigrid"])
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize(
+    *in_pairs(
+        method=["cg", "chebyshev", "multigrid"],
+        dtype=[torch.float64, torch.float32],
+        dim=[2, 3],
+        kernel=["quadratic", "cubic"],
+    )
+)
 def test_energy_after_any_number_of_iterations(device, dim, kernel, dtype, method):
     h = heat(dim, kernel, device, dtype, sizes=(500, 0, 300))
     for most in (1, 2, 5, 200):

@@ -8,6 +8,7 @@ import pytest
 import torch
 from cases.heat import FLOAT, block, check_gradients, random_like
 from helpers import relative_error
+from pairs import in_pairs
 
 import torch_mpm as mpm
 from benchmarks.accuracy.heat_fronts import between_surfaces, lag
@@ -208,6 +209,9 @@ def test_bad_input():
         heat.check()
 
 
+@pytest.mark.thorough(place=0.0)
+@pytest.mark.thorough(place=0.25)
+@pytest.mark.thorough(place=0.5, transfer="flip")
 @pytest.mark.parametrize("place", [0.0, 0.13, 0.25, 0.5, 0.75])
 @pytest.mark.parametrize("per_cell,transfer,least,most", [(4, "hybrid", 0.0, 0.042), (1, "hybrid", 0.05, 0.23),
                                                           (4, "flip", 0.5, 1.2)])  # fmt: skip
@@ -254,9 +258,7 @@ def test_steps_that_are_too_long_for_a_front_are_reported(device):
         heat.check()
 
 
-@pytest.mark.parametrize("kind", [FixedSurface, Fixed])
-@pytest.mark.parametrize("lap", [0.0, 0.15])
-@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize(*in_pairs(kind=[FixedSurface, Fixed], lap=[0.0, 0.15], dim=[2, 3]))
 def test_a_floor_of_several_boxes_is_held_as_one(kind, lap, dim):
     """Their inner faces, and the edges of their seams, are no surfaces, in any order of the boxes."""
     dx = 0.1

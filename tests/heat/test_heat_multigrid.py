@@ -55,6 +55,7 @@ def weighted_error(h: Heat, increment: Tensor, exact: Tensor) -> float:
 # ---- parts
 
 
+@pytest.mark.thorough(dim=3, kernel="quadratic")
 def test_stencil_has_the_entries_of_the_operator(device, dim, kernel):
     h = heat(dim, kernel, device, sizes=(40, 0, 30), dx=0.4)
     stencil = torch.ops.torch_mpm.heat_stencil(h.x, h.conductance, *h.blocks.packed)

@@ -6,6 +6,7 @@ import warnings
 import pytest
 import torch
 from helpers import relative_error
+from pairs import in_pairs
 
 import torch_mpm as mpm
 from benchmarks.catalogue.laws import named
@@ -178,8 +179,9 @@ def held(step, *terms):
     return step
 
 
-@pytest.mark.parametrize("kind", [heat_boundaries.Fixed, heat_boundaries.FixedSurface])
-@pytest.mark.parametrize("shape", bodies(2))
+@pytest.mark.parametrize(
+    *in_pairs(kind=[heat_boundaries.Fixed, heat_boundaries.FixedSurface], shape=bodies(2), dim=[2, 3])
+)
 def test_held_obstacles(dim, shape, kind, device):
     step, state = scene(dim, melts=True, device=device)
     region = bodies(dim)[shape]
@@ -218,8 +220,7 @@ def terms(scenes=1, particles=0):
     }
 
 
-@pytest.mark.parametrize("with_held", [False, True])
-@pytest.mark.parametrize("name", [*terms(), "all"])
+@pytest.mark.parametrize(*in_pairs(with_held=[False, True], name=[*terms(), "all"], dim=[2, 3]))
 def test_free_surface_and_sources(dim, name, with_held, device):
     """Terms of boundaries, alone, together and beside obstacles that hold a temperature."""
     step, state = scene(dim, melts=True, device=device)
@@ -424,8 +425,11 @@ def test_random_laws_that_read_the_temperature(seed, device):
 FLOWING = ("von_mises", "sand", "viscoelastic", "snow", "cam_clay", "herschel_bulkley")
 
 
-@pytest.mark.parametrize("with_source", [False, True])
-@pytest.mark.parametrize("name", [*FLOWING, "melting and flow", "expansion and flow", "mixture"])
+@pytest.mark.parametrize(
+    *in_pairs(
+        with_source=[False, True], name=[*FLOWING, "melting and flow", "expansion and flow", "mixture"], dim=[2, 3]
+    )
+)
 def test_plastic_heating(dim, name, with_source, device):
     """Energy that laws dissipate becomes heat, alone and beside a source."""
     names = ["von_mises", "melting and flow", "neo_hookean", "sand"] if name == "mixture" else [name]

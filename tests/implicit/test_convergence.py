@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from pairs import in_pairs
 
 import torch_mpm as mpm
 from benchmarks.catalogue.scenes import block
@@ -30,9 +31,9 @@ def cantilever_sag(E, layers, length=0.5, nu=0.3):
     return weight * length**4 * (1 - nu**2) / (8 * E * float(rows.square().sum()) * DX / 2)
 
 
-@pytest.mark.parametrize("stress_form", ["mls", "gradient"])
-@pytest.mark.parametrize("E", [1e6, 1e8, 1e9, 1e10])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(
+    *in_pairs(stress_form=["mls", "gradient"], E=[1e6, 1e8, 1e9, 1e10], dtype=[torch.float32, torch.float64])
+)
 def test_a_strip_without_bending_stiffness_is_not_solved(E, dtype, stress_form, device):
     """One row of particles bends without energy: it falls until it hangs. What a solve leaves of that is reported."""
     grid, start = strip(1, dtype, device)
@@ -45,9 +46,7 @@ def test_a_strip_without_bending_stiffness_is_not_solved(E, dtype, stress_form, 
         step.check(end)
 
 
-@pytest.mark.parametrize("dt", [1e2, 1e3, 1e6])
-@pytest.mark.parametrize("E", [1e9, 1e11])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(*in_pairs(dt=[1e2, 1e3, 1e6], E=[1e9, 1e11], dtype=[torch.float32, torch.float64]))
 def test_a_strip_of_two_rows_sags(E, dtype, dt, device):
     """For any stiffness and length of the step, in either precision."""
     grid, start = strip(2, dtype, device)
@@ -60,9 +59,9 @@ def test_a_strip_of_two_rows_sags(E, dtype, dt, device):
     assert abs(sag / cantilever_sag(E, 2) - 1) < 0.08
 
 
-@pytest.mark.parametrize("dt", [1.0, 1e2, 1e3])
-@pytest.mark.parametrize("E", [1e7, 1e8, 1e9])
-@pytest.mark.parametrize("law", [mpm.Hencky, mpm.NeoHookean, mpm.FixedCorotated])
+@pytest.mark.parametrize(
+    *in_pairs(dt=[1.0, 1e2, 1e3], E=[1e7, 1e8, 1e9], law=[mpm.Hencky, mpm.NeoHookean, mpm.FixedCorotated])
+)
 def test_a_beam_stays_at_its_clamp(law, E, dt, device):
     """Torn off and falling, a body of logarithmic strain has less energy than at rest, if the step is long."""
     grid, start = strip(4, torch.float64, device, length=0.2)

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 from helpers import relative_error
+from pairs import in_pairs
 
 import torch_mpm as mpm
 from torch_mpm.implicit import Implicit
@@ -278,9 +279,9 @@ OBLIQUE = [
 ]
 
 
-@pytest.mark.parametrize("friction", [0.1, 0.27])
-@pytest.mark.parametrize("degrees", [17, 24, 45])
-@pytest.mark.parametrize(("shape", "kind", "shape_dim", "dtype"), OBLIQUE)
+@pytest.mark.parametrize(
+    *in_pairs({("shape", "kind", "shape_dim", "dtype"): OBLIQUE}, friction=[0.1, 0.27], degrees=[17, 24, 45])
+)
 def test_a_block_slides_down_a_slope_that_is_oblique_to_the_lattice(
     shape, kind, shape_dim, dtype, degrees, friction, device
 ):

@@ -31,8 +31,13 @@ def check_gradients(grid, values, limit, names=NAMES, **arguments):
         assert float((terms.sum() - difference).abs() / terms.norm()) < limit, name  # terms may cancel
 
 
+SIDES = (None, "sticky", "slip", "separate")
 FORMS_AND_WALLS = [
-    *((2, form, walls) for form in ("mls", "gradient") for walls in (None, "sticky", "slip", "separate")),
+    *((2, form, walls) for form, walls in zip(("mls", "gradient") * 2, SIDES, strict=True)),
+    *(
+        pytest.param(2, form, walls, marks=pytest.mark.thorough)
+        for form, walls in zip(("gradient", "mls") * 2, SIDES, strict=True)
+    ),
     (3, "mls", "separate"),
     (3, "gradient", "sticky"),
     (2, "mls", "mirror"),

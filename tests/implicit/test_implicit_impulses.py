@@ -5,6 +5,7 @@ import torch
 from cases.implicit_gradients import NAMES, TIGHT, inputs
 from cases.implicit_obstacles import check, obstacle, parameters
 from helpers import relative_error
+from pairs import in_pairs
 
 import torch_mpm as mpm
 from torch_mpm.implicit import Implicit
@@ -23,7 +24,7 @@ def stepped(grid, values, boundaries=(), walls=None, integrator=None, dt=None, *
 
 
 @pytest.mark.parametrize("walls", WALLS, ids=str)
-@pytest.mark.parametrize("kind", ["sticky", "slip", "separate"])
+@pytest.mark.parametrize(*in_pairs(kind=["sticky", "slip", "separate"], dim=[2, 3]))
 def test_what_is_taken_is_missing(kind, walls, dim, device):
     """The change of the momentum of the particles is what gravity gives and boundaries take."""
     grid, values = inputs(dim, device)
@@ -37,8 +38,9 @@ def test_what_is_taken_is_missing(kind, walls, dim, device):
     assert relative_error(taken.total[0], weight - gained) < 1e-9
 
 
-@pytest.mark.parametrize("floor", [None, "slip", "sticky", "rough"])
-@pytest.mark.parametrize("kind", ["sticky", "slip", "separate"])
+@pytest.mark.parametrize(
+    *in_pairs(floor=[None, "slip", "sticky", "rough"], kind=["sticky", "slip", "separate"], dim=[2, 3])
+)
 def test_short_steps_give_what_explicit_ones_do(kind, floor, dim, device):
     """On each surface, with its moment, where no two of them meet at a node."""
     grid, values = inputs(dim, device)

@@ -7,6 +7,7 @@ import torch
 from cases.implicit_gradients import TIGHT, inputs, run
 from cases.implicit_obstacles import check, obstacle, parameters
 from helpers import relative_error
+from pairs import each_once
 
 import torch_mpm as mpm
 from torch_mpm.implicit import Implicit, equilibrium
@@ -27,8 +28,7 @@ def weighed(device, dim):
 
 
 @pytest.mark.thorough(dim=3)
-@pytest.mark.parametrize(("kind", "friction"), KINDS)
-@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize(*each_once({("kind", "friction"): KINDS}, shape=SHAPES))
 def test_gradients_by_motion_and_shape(shape, kind, friction, dim, device):
     if dim == 3 and (kind, friction) != ("separate", 0.2) and shape != OF_ALL_KINDS[kind, friction]:
         pytest.skip("2-D has it")

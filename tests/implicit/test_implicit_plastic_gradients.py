@@ -8,6 +8,7 @@ yield or are elastic by much more than the differences move them: on the yield s
 import pytest
 import torch
 from helpers import relative_error
+from pairs import each_once
 
 import torch_mpm as mpm
 from benchmarks.catalogue.laws import having
@@ -117,8 +118,7 @@ def check_gradients(grid, values, law, groups, limit, **arguments):
         assert bool(difference != 0) and error < limit * float(difference.abs()) + rounding, group
 
 
-@pytest.mark.parametrize("plasticity", ["after", "inside"])
-@pytest.mark.parametrize("law", LAWS, ids=name_of)
+@pytest.mark.parametrize(*each_once(plasticity=["after", "inside"], law=LAWS), ids=name_of)
 def test_gradients_of_every_law(law, plasticity, device):
     grid, values = inputs(law, 2, device)
     check_gradients(grid, values, law, groups_of(law), 1e-6, plasticity=plasticity, walls="sticky")

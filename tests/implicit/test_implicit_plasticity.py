@@ -6,6 +6,7 @@ import math
 import pytest
 import torch
 from helpers import relative_error
+from pairs import each_once
 
 import torch_mpm as mpm
 from benchmarks.catalogue.laws import having, named
@@ -156,8 +157,7 @@ def test_many_steps_yield_as_one(device):
     assert relative_error(many[0][0, 0], one[0][0, 0]) < 0.01 and abs(many[1] / one[1] - 1) < 0.15
 
 
-@pytest.mark.parametrize("name", LAWS)
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(*each_once(name=LAWS, dtype=[torch.float32, torch.float64]))
 def test_every_plastic_law_converges(name, dtype, device):
     """A block falls on the floor, with friction there, at five times the explicit limit of elastic waves."""
     grid, state = body(2, device, dtype)

@@ -8,6 +8,7 @@ import math
 import pytest
 import torch
 from cases.matrices import rotations
+from pairs import in_pairs
 from torch import Tensor
 
 import torch_mpm as mpm
@@ -91,9 +92,13 @@ def test_second_update_changes_nothing(device, dim, dtype, name):
     assert_second_update_changes_nothing(law, states(dim, dtype, device), dt=1.0 if name == "plastic_fluid" else 0.0)
 
 
-@pytest.mark.parametrize(("energy", "flow", "apex"), SAND_FORMS)
-@pytest.mark.parametrize(("correction", "cohesive", "hardens"), SAND_OPTIONS)
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(
+    *in_pairs(
+        {("energy", "flow", "apex"): SAND_FORMS, ("correction", "cohesive", "hardens"): SAND_OPTIONS},
+        dtype=[torch.float32, torch.float64],
+        dim=[2, 3],
+    )
+)
 def test_second_update_of_sand_changes_nothing(device, dim, dtype, energy, flow, apex, correction, cohesive, hardens):
     law = mpm.QuarticSand(
         E=E,

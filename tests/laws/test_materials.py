@@ -6,6 +6,7 @@ import pytest
 import torch
 from helpers import OpNames, relative_error
 from oracle import material as reference
+from pairs import in_pairs
 from torch import Tensor
 
 import torch_mpm as mpm
@@ -221,8 +222,7 @@ def test_wave_speed_depends_on_strain(device: str) -> None:
 # ---- gradients
 
 
-@pytest.mark.parametrize("shape", ["scalar", "scene", "particle"])
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize(*in_pairs(shape=["scalar", "scene", "particle"], law=LAWS, dim=[2, 3]))
 def test_first_and_second_derivatives(law: str, shape: str, dim: int, device: str) -> None:
     state, parameters, C, scene = arguments(law, dim, count=2, shape=shape)
     scene = scene.to(device)

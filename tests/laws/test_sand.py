@@ -14,6 +14,7 @@ import pytest
 import torch
 from cases.matrices import deformation, rotations
 from oracle import sand as reference
+from pairs import each_once, in_pairs
 from torch import Tensor
 
 import torch_mpm as mpm
@@ -59,9 +60,11 @@ def error(value: Tensor, expected: Tensor) -> float:
 # ---- values
 
 
-@pytest.mark.parametrize(("energy", "apex", "flow"), FORMS)
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("shifted", [False, True])
+@pytest.mark.parametrize(
+    *in_pairs(
+        {("energy", "apex", "flow"): FORMS}, dtype=[torch.float32, torch.float64], shifted=[False, True], dim=[2, 3]
+    )
+)
 def test_return_map_is_the_reference(device, dim, energy, apex, flow, dtype, shifted):
     """`shifted`: with cohesion and the correction of lost volume."""
     F, mu, lam, angle = random_states(501 if flow == "exact" else 1001, dim)
@@ -375,18 +378,16 @@ def test_closing_gap_gives_no_energy(device, dim, energy):
     assert 0 < float(state.extra["volume_correction"].min()) < 0.2
 
 
-@pytest.mark.parametrize("energy", ENERGIES)
-@pytest.mark.parametrize(
-    "options",
-    [
-        {},
-        {"volume_correction": True},
-        {"volume_correction": True, "cohesion": 2e-4},
-        {"volume_correction": True, "friction_angle": 0.8},
-        {"cohesion": 1e-3, "hardening": KLAR},
-    ],
-    ids=["dry", "torn", "tearing", "steep", "cohesive"],
-)
+COLUMNS = {
+    "dry": {},
+    "torn": {"volume_correction": True},
+    "tearing": {"volume_correction": True, "cohesion": 2e-4},
+    "steep": {"volume_correction": True, "friction_angle": 0.8},
+    "cohesive": {"cohesion": 1e-3, "hardening": KLAR},
+}
+
+
+@pytest.mark.parametrize(*each_once(energy=ENERGIES, options=COLUMNS))
 def test_heat_of_a_collapsing_column_is_the_energy_that_it_loses(device, energy, options):
     """The power of the stresses is stored or becomes heat, particle by particle, to the order of the time step.
 
@@ -394,7 +395,7 @@ def test_heat_of_a_collapsing_column_is_the_energy_that_it_loses(device, energy,
     """
     errors = []
     for dt in (4e-4, 2e-4):
-        column = collapsing_column(mpm.QuarticSand(E=1e6, nu=0.3, energy=energy, **options), dt, device)
+        column = collapsing_column(mpm.QuarticSand(E=1e6, nu=0.3, energy=energy, **COLUMNS[options]), dt, device)
         errors.append((column.heat + column.elastic - column.work) / column.heat)
         assert column.heat + column.elastic < column.lost * 1.001
     assert abs(errors[1]) < 0.03

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from pairs import each_once
 
 import torch_mpm as mpm
 from torch_mpm.geometry import shapes
@@ -89,8 +90,7 @@ def test_lines_through_vertices_and_edges(name):
     assert (found[inside] == 1).all() and (found[outside] == 0).all()
 
 
-@pytest.mark.parametrize("name", MESHES)
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(*each_once(name=MESHES, dtype=[torch.float32, torch.float64]))
 def test_distance_and_normal_are_those_of_all_triangles(name, dtype):
     shape, x = shapes.Mesh(MESHES[name]()) if name != "parts" else None, torch.cat([anywhere(300), anywhere(50, 5.0)])
     if shape is None:

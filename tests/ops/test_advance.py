@@ -4,18 +4,19 @@ import pytest
 import torch
 from helpers import Particles, random_particles, relative_error
 from oracle import advance as reference
+from pairs import in_pairs
 
 import torch_mpm as mpm
 
 DT = 0.013
-CASES = [
-    pytest.param({"F": True}, id="solid"),
-    pytest.param({"J": True}, id="fluid"),
-    pytest.param({"F": True, "J": True, "affine": False}, id="no C"),
-    pytest.param({"F": True, "stress_form": "gradient"}, id="gradient"),
-    pytest.param({"J": True, "stress_form": "gradient", "affine": False}, id="gradient, no C"),
-    pytest.param({}, id="neither"),
-]
+CASES = {
+    "solid": {"F": True},
+    "fluid": {"J": True},
+    "no C": {"F": True, "J": True, "affine": False},
+    "gradient": {"F": True, "stress_form": "gradient"},
+    "gradient, no C": {"J": True, "stress_form": "gradient", "affine": False},
+    "neither": {},
+}
 OUTPUTS = ("x", "v", "C", "F", "J")
 
 
@@ -45,14 +46,14 @@ def test_g2p_advance_is_the_reference(device, dim, kernel, case, with_dt):
     p = random_particles(dim, kernel, device=device, sizes=(70, 0, 50))
     blocks = p.blocks()
     velocity = node_velocity(blocks, p.x)
-    tensors, options = inputs(p, case)
+    tensors, options = inputs(p, CASES[case])
     dt = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64, device=device) if with_dt else DT
     got = mpm.g2p_advance(blocks, p.x, velocity, dt, **tensors, **options)
     expected = reference.g2p_advance(
-        blocks, p.x, velocity, dt[p.scene] if with_dt else dt, **tensors, stress_form=case.get("stress_form", "mls")
+        blocks, p.x, velocity, dt[p.scene] if with_dt else dt, **tensors, stress_form=options.get("stress_form", "mls")
     )
     for name, value, other in zip(OUTPUTS, got, expected, strict=True):
-        if (name in "FJ" and tensors[name] is None) or (name == "C" and not case.get("affine", True)):
+        if (name in "FJ" and tensors[name] is None) or (name == "C" and not CASES[case].get("affine", True)):
             assert value is None
         else:
             assert relative_error(value, other) < 1e-14, name
@@ -74,11 +75,11 @@ def test_g2p_advance_is_the_composition(device, dim, kernel, count):
             assert relative_error(value, other) < 3e-7
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(*in_pairs(case=CASES, dim=[2, 3], kernel=["quadratic", "cubic"]))
 def test_g2p_advance_gradients(device, dim, kernel, case):
     p = random_particles(dim, kernel, device=device, sizes=(2, 0, 1))
     blocks = p.blocks()
-    tensors, options = inputs(p, case)
+    tensors, options = inputs(p, CASES[case])
     names = [name for name, value in tensors.items() if value is not None]
     mix = torch.randn(blocks.node_count, 2, dtype=torch.float64, device=device)
     nodes = torch.randn(2, dim, dtype=torch.float64, device=device)

@@ -3,6 +3,7 @@
 import pytest
 import torch
 from cases.rollouts import LAWS_HERE, TRANSFERS, WALLS, assert_equal
+from pairs import in_pairs
 
 import torch_mpm as mpm
 from benchmarks.catalogue.scenes import blob, touched, unit_box
@@ -51,10 +52,9 @@ def made(law: str, transfer: str, walls: str, obstacles: str, device: str) -> tu
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("obstacles", ["none", "sphere", "corner", "late corner"])
-@pytest.mark.parametrize("walls", WALLS)
-@pytest.mark.parametrize("transfer", TRANSFERS)
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize(
+    *in_pairs(law=LAWS, transfer=TRANSFERS, walls=WALLS, obstacles=["none", "sphere", "corner", "late corner"])
+)
 def test_schedules_agree(law, transfer, walls, obstacles, device):
     expected = None
     for schedule in SCHEDULES:

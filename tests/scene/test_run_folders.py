@@ -72,6 +72,7 @@ def printed(capsys, *arguments):
 # ---- full disks
 
 
+@pytest.mark.thorough(size=500)
 @pytest.mark.parametrize("size", [500, 20_000])
 def test_a_full_disk_ends_with_its_message(scene, tmp_path, size):
     def small_disk():

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 from helpers import disc, result, run_quick
+from pairs import each_once
 
 import torch_mpm as mpm
 from benchmarks import report
@@ -22,7 +23,7 @@ def moduli(load: float, compression: float) -> tuple[float, float]:
 # ---- at rest
 
 
-@pytest.mark.parametrize("energy", ["unilateral", "full", "mixed"])
+@pytest.mark.parametrize(*each_once(energy=["unilateral", "full", "mixed"], dim=[2, 3]))
 def test_confined_column_at_rest(device, dim, energy):
     """Dropped on itself and damped, it finds the elastic profile and K₀ = ν/(1 − ν)."""
     height, dx = 0.8, 0.1

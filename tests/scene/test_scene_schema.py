@@ -200,7 +200,14 @@ def test_descriptions_reach_the_schema():
     assert "Young's modulus [Pa]" in text and "distance between grid nodes [m]" in text
 
 
-@pytest.mark.parametrize("path", EXAMPLES, ids=lambda p: p.stem)
+LARGE = ("sand_blade", "sand_cylinder", "hourglass")
+
+
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(p, marks=pytest.mark.thorough) if p.stem in LARGE else p for p in EXAMPLES],
+    ids=lambda p: p.stem,
+)
 def test_examples_build_and_name_their_plan(path):
     scene = Scene.load(path, ["device=cpu"])
     if any(getattr(body, "shape", None) == "mesh" for body in scene.body):

@@ -6,6 +6,7 @@ from functools import partial
 
 import pytest
 import torch
+from pairs import in_pairs
 
 import torch_mpm as mpm
 from benchmarks.catalogue.laws import LAWS, named
@@ -77,9 +78,7 @@ def test_the_out_of_plane_stress_is_that_of_the_law_in_3d(name, device):
         torch.testing.assert_close(field(step_of(law, 2), flat, measure), expected, rtol=1e-9, atol=1e-7)
 
 
-@pytest.mark.parametrize("output", MEASURES)
-@pytest.mark.parametrize("dim", [2, 3])
-@pytest.mark.parametrize("name", [*ELASTIC, *OTHERS])
+@pytest.mark.parametrize(*in_pairs(output=MEASURES, dim=[2, 3], name=[*ELASTIC, *OTHERS]))
 def test_fields_of_all_laws(name, dim, output, device):
     """Each has its shape, and all follow from the Kirchhoff stress, J and the out-of-plane stress."""
     law = (ELASTIC | OTHERS)[name](**({"direction": (0.6, 0.8, 0.0)[:dim]} if name == "active" else {}))
