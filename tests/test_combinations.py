@@ -4,6 +4,7 @@
 seed that makes its combination again.
 """
 
+import math
 import os
 from collections.abc import Callable
 
@@ -14,7 +15,7 @@ from torch import Tensor
 
 import torch_mpm as mpm
 
-COUNT, QUICK = int(os.environ.get("COMBINATIONS", "60")), 35
+COUNT = int(os.environ.get("COMBINATIONS", "60"))
 FIELDS = ("x", "v", "C", "F", "J", "temperature")
 DIFFERENTIABLE = ("x", "v", "C", "F", "J", "mass", "volume", "temperature")
 
@@ -22,9 +23,10 @@ DRAWN = [draw(seed) for seed in range(COUNT)]
 
 
 def every(holds: Callable[[Combination], bool] = lambda c: True) -> pytest.MarkDecorator:
-    """The combinations for which something holds."""
-    marks = [pytest.mark.thorough] if "COMBINATIONS" not in os.environ else []
-    cases = [pytest.param(c, marks=marks if c.seed >= QUICK else []) for c in DRAWN if holds(c)]
+    """The combinations for which something holds; the last of them are thorough."""
+    those = [c for c in DRAWN if holds(c)]
+    quick = len(those) if "COMBINATIONS" in os.environ else math.ceil(0.6 * len(those))
+    cases = [pytest.param(c, marks=() if k < quick else pytest.mark.thorough) for k, c in enumerate(those)]
     return pytest.mark.parametrize("c", cases, ids=lambda c: f"{c.seed}-{c.law}")
 
 

@@ -137,7 +137,7 @@ def test_limits_program(tmp_path: Path) -> None:
 @pytest.mark.parametrize("program", ["convergence", "precision", "ritter", "rollout_gradients"])
 def test_accuracy_program(program: str, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
-    run_quick(f"benchmarks.accuracy.{program}", tmp_path)
+    run_quick_here(f"benchmarks.accuracy.{program}", tmp_path)
     result(tmp_path, f"{program}.json")
 
 
@@ -191,7 +191,7 @@ def test_captions_of_the_documents_have_a_sentence_per_line() -> None:
 def test_return_map_of_sand_against_extended_precision(tmp_path: Path) -> None:
     for package in ("matplotlib", "mpmath", "torch_mpm._math"):
         pytest.importorskip(package)
-    run_quick("benchmarks.accuracy.sand", tmp_path)
+    run_quick_here("benchmarks.accuracy.sand", tmp_path)
     for row in result(tmp_path, "sand_accuracy.json")["rows"]:
         assert row["reference against 50 digits"] < 1e-18
         for name in ("float32", "float64"):
@@ -213,7 +213,7 @@ def test_gradients_of_sand_program(tmp_path: Path) -> None:
 
 @pytest.mark.thorough
 def test_no_law_is_unstable_below_its_estimate(tmp_path: Path) -> None:
-    run_quick("benchmarks.stability.law_dt", tmp_path)
+    run_quick_here("benchmarks.stability.law_dt", tmp_path)
     cases = result(tmp_path, "stability_laws.json")["cases"]
     assert {case["law"] for case in cases} == set(LAWS) - {"neo-Hookean"}
     assert all(1 <= case["stable"] < 10 for case in cases)

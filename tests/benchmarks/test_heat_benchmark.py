@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers import random_particles, result, run_quick, run_quick_here
+from helpers import random_particles, result, run_quick_here
 from oracle.heat import HeatOperator
 
 from benchmarks import report
@@ -22,7 +22,7 @@ def test_gradients_of_the_heat_matrix(dim: int, kernel: str) -> None:
 
 @pytest.mark.thorough
 def test_heat_benchmark(tmp_path: Path) -> None:
-    run_quick("benchmarks.accuracy.heat", tmp_path)
+    run_quick_here("benchmarks.accuracy.heat", tmp_path)
     found = result(tmp_path, "heat.json")
     errors = {(c["problem"], c["transfer"]): c["rows"][-1]["error"] for c in found["cases"]}
     assert len(errors) == 20 and (tmp_path / "heat.png").exists()
