@@ -15,10 +15,6 @@ MPM_HD float expm1(float x) { return ::expm1f(x); }
 MPM_HD double expm1(double x) { return ::expm1(x); }
 MPM_HD float sqrt(float x) { return ::sqrtf(x); }
 MPM_HD double sqrt(double x) { return ::sqrt(x); }
-MPM_HD float sin(float x) { return ::sinf(x); }
-MPM_HD double sin(double x) { return ::sin(x); }
-MPM_HD float cos(float x) { return ::cosf(x); }
-MPM_HD double cos(double x) { return ::cos(x); }
 MPM_HD float abs(float x) { return ::fabsf(x); }
 MPM_HD double abs(double x) { return ::fabs(x); }
 MPM_HD float max(float a, float b) { return a > b ? a : b; }
@@ -27,6 +23,20 @@ MPM_HD float select(bool condition, float a, float b) { return condition ? a : b
 MPM_HD double select(bool condition, double a, double b) { return condition ? a : b; }
 MPM_HD float value_of(float x) { return x; }
 MPM_HD double value_of(double x) { return x; }
+
+// On a GPU in half turns: the reduction of large angles in radians needs local memory and registers, even where none
+// occurs. The error is that of x, half an ulp.
+#ifdef __CUDA_ARCH__
+MPM_HD float sin(float x) { return ::sinpif(float(M_1_PI) * x); }
+MPM_HD double sin(double x) { return ::sinpi(M_1_PI * x); }
+MPM_HD float cos(float x) { return ::cospif(float(M_1_PI) * x); }
+MPM_HD double cos(double x) { return ::cospi(M_1_PI * x); }
+#else
+MPM_HD float sin(float x) { return ::sinf(x); }
+MPM_HD double sin(double x) { return ::sin(x); }
+MPM_HD float cos(float x) { return ::cosf(x); }
+MPM_HD double cos(double x) { return ::cos(x); }
+#endif
 
 // ln a of a = 1 + a_minus_1; both are given because each is inaccurate where the other is accurate.
 MPM_HD float log_1p(float a, float a_minus_1) { return ::fabsf(a_minus_1) < 0.5f ? ::log1pf(a_minus_1) : ::logf(a); }

@@ -90,14 +90,15 @@ class NearestSurface {
   // Of the obstacles that were given. `walled` is whether walls are near.
   MPM_HD NodeTouch<T, D> found(bool walled) {
     const T wall = walled ? nearest_wall(a_, position_) : std::numeric_limits<T>::max();
-    const T away = 2 * SolidAt<T, D>::seam_of(a_) - nearest_;
-    const bool joins = is_inside() && (second_ <= away || wall <= away);
+    const bool joins = is_inside() && (second_ <= away() || (wall <= away() && !is_along_walls()));
     if (joins || wall <= near_wall(a_)) touch_.obstacle = NodeTouch<T, D>::several;
     return touch_;
   }
 
-  // Of a node at a wall or beyond, seen from the point of the wall. Samples of distances have slopes up to √D.
-  MPM_HD NodeTouch<T, D> at_wall() const {
+  // Of a node at a wall or beyond, seen from the point of the wall; `sign` as `within_walls` gives it. Samples of
+  // distances have slopes up to √D.
+  MPM_HD NodeTouch<T, D> at_wall(const Vector<T, D>& sign) {
+    if (is_inside() && second_ > away() && is_along_walls(&sign)) return touch_;
     NodeTouch<T, D> touch;
     const T way = T(1.001 * D) * SolidAt<T, D>::seam_of(a_);
     if (nearest_ <= a_.rounding + way) touch.obstacle = NodeTouch<T, D>::several;
@@ -108,6 +109,25 @@ class NearestSurface {
   MPM_HD static T near_wall(const ContactArguments<T, D>& a) { return a.rounding + T(1e-6 * a.dx); }
 
  private:
+  // Faces and walls within this distance may join the nearest surface.
+  MPM_HD T away() const { return 2 * SolidAt<T, D>::seam_of(a_) - nearest_; }
+
+  // Whether the nearest surface and its velocity are parallel to all walls that are near, and to mirrors that the node
+  // is behind. Contact with the surface alone keeps the velocity that the walls gave the node then.
+  MPM_HD bool is_along_walls(const Vector<T, D>* sign = nullptr) {
+    constexpr double parallel = 1e-6;  // sine of the angle
+    const T fastest = T(parallel) * length(touch_.velocity);
+    bool along = true;
+    MPM_UNROLL for (int face = 0; face < 2 * D; face++) {
+      const int axis = face / 2;
+      const bool mirrored = sign && (*sign)[axis] < T(0);
+      if (a_.wall_kind[face] == Contact::open || !(mirrored || wall_height(a_, face, position_) <= away())) continue;
+      along = along && abs(touch_.normal[axis]) <= T(parallel) && abs(touch_.velocity[axis]) <= fastest;
+      touch_.normal[axis] = touch_.velocity[axis] = T(0);
+    }
+    return along;
+  }
+
   const ContactArguments<T, D>& a_;
   const Vector<T, D> position_;
   T nearest_ = std::numeric_limits<T>::max(), second_ = std::numeric_limits<T>::max();
@@ -178,16 +198,20 @@ MPM_HD_CALL void find_surfaces(bool wanted, const SlotPoses<T, D>& poses, const 
 
 // ---- any node
 
-template <class T, int D>
+// `Exact`: a node at a wall always meets several surfaces, whose derivatives are those of the walls, too.
+template <bool Exact = false, class T, int D>
 MPM_HD NodeTouch<T, D> touch_of_node(const SlotPoses<T, D>& poses, const Vector<T, D>& position) {
   if (poses.s.near == 0) return {};
-  NearestSurface<T, D> nearest(poses.a, position);
+  Vector<T, D> sign;
+  const bool at_wall =
+      !Exact && poses.s.walled && nearest_wall(poses.a, position) <= NearestSurface<T, D>::near_wall(poses.a);
+  NearestSurface<T, D> nearest(poses.a, at_wall ? within_walls(poses.a, position, T(0), sign) : position);
   const auto visit = [&](uint64_t obstacles) {
     for (uint64_t left = obstacles; left; left &= left - 1) nearest(lowest_bit(left), poses[lowest_bit(left)]);
   };
   visit(poses.s.touching);
-  if (nearest.is_inside()) visit(poses.s.near & ~poses.s.touching);
-  return nearest.found(poses.s.walled);
+  if (at_wall || nearest.is_inside()) visit(poses.s.near & ~poses.s.touching);
+  return at_wall ? nearest.at_wall(sign) : nearest.found(poses.s.walled);
 }
 
 // Finds the surfaces that a node at a position meets; `c` has none yet. By all threads of a warp, as `any_of_warp`.
@@ -195,7 +219,7 @@ template <class T, int D>
 MPM_HD void find_contact(bool wanted, const SlotPoses<T, D>& poses, const Vector<T, D>& position,
                          NodeContact<T, D>& c) {
   int k = NodeTouch<T, D>::none;
-  if (wanted) k = touch_of_node(poses, position).obstacle;
+  if (wanted) k = touch_of_node<true>(poses, position).obstacle;
   const bool several = k == NodeTouch<T, D>::several;
   if (any_of_warp(several)) {
     find_surfaces(several, poses, position, c);
@@ -408,7 +432,7 @@ MPM_HD NodeTouch<T, D> lone_touch(const ContactArguments<T, D>& a, int scene, co
     const ObstaclePose<T, D> pose = obstacle_pose(a, a.kind[k], row[k], scene);
     if (pose.acts) nearest(k, pose);
   }
-  if (at_wall) return nearest.at_wall();
+  if (at_wall) return nearest.at_wall(sign);
   return nearest.is_inside() ? nearest.found(is_walled(a, corner)) : NodeTouch<T, D>{};
 }
 

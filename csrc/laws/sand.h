@@ -337,12 +337,7 @@ struct SandKernels : PrincipalKernels<Law> {
     const SandParameters<V> p = load_parameters<Energy, V>(at, a.law);
     const SandState<V, D> state = sand_state<Energy, V>(s, p, a.law);
 
-    Vector<V, D> factor;
-    MPM_UNROLL for (int i = 0; i < D; i++)
-      factor[i] = exponential(state.h[i] - s.h[i]) / s.scale;
-    store_matrix<D>(at, a.state, select(state.moved, compose(s.U, factor, s.B), F));
-    store_matrix<D>(at, a.stress, select(state.valid, compose(s.U, state.stress, s.U), zero_matrix<V, D>()));
-
+    // Scalars first: the strains need no registers in the products of matrices then.
     if (a.branch) {
       const V branch = select(state.m.cone, V(kCone), select(state.m.apex, V(kApex), V(kElastic))) +
                        select(state.m.converged, V(0), V(kNotConverged));
@@ -352,7 +347,7 @@ struct SandKernels : PrincipalKernels<Law> {
     if (a.multiplier.pointer || hardens) {
       const V multiplier = select(state.moved, plastic_increment(s.h, state.h).norm, V(0));
       if (a.multiplier.pointer) at.store(a.multiplier.pointer, a.multiplier.stride[0], multiplier);
-      if (hardens) store_entry(at, a.history, 0, p.slope[kHardening] + multiplier);
+      if (hardens) store_entry(at, a.history, 0, convert<V>(load_scalar_or_zero(at, a.law.history[0])) + multiplier);
     }
     if (a.dissipated.pointer) {
       const V lost = dissipated_energy<Energy>(dissipation<Energy>(s, state, p), state.h, p.mu, p.lam);
@@ -362,6 +357,12 @@ struct SandKernels : PrincipalKernels<Law> {
     if (a.history.pointer && volume_correction(a.law).pointer)
       store_entry(at, a.history, volume_place(a.law),
                   select(state.valid, select(state.tears, p.volume + sum(s.h), V(0)), p.volume));
+
+    Vector<V, D> factor;
+    MPM_UNROLL for (int i = 0; i < D; i++)
+      factor[i] = exponential(state.h[i] - s.h[i]) / s.scale;
+    store_matrix<D>(at, a.state, select(state.moved, compose(s.U, factor, s.B), F));
+    store_matrix<D>(at, a.stress, select(state.valid, compose(s.U, state.stress, s.U), zero_matrix<V, D>()));
   }
 
   // The strains, their map and its adjoint in W, the axes in V: for float32 arguments in float64 and float32, because a

@@ -102,9 +102,14 @@ __device__ __noinline__ void add_contact(const NextGridArguments<T, D>& a, const
   }
 }
 
+// Blocks of a multiprocessor at least. Without obstacles the kernel waits for memory only: registers for more loads of
+// a thread cost more threads than they save.
+template <bool Obstacles, class T>
+constexpr int kLeastBlocks = Obstacles ? (sizeof(T) == 4 ? 2 : 1) : (sizeof(T) == 4 ? 5 : 3);
+
 // The place of the first node of a thread, and the obstacle that touches it, are found during P2G.
 template <bool Obstacles, class T, int D>
-__global__ void __launch_bounds__(kThreads, sizeof(T) == 4 ? 2 : 1)
+__global__ void __launch_bounds__(kThreads, kLeastBlocks<Obstacles, T>)
     next_grid_kernel(const __grid_constant__ NextGridArguments<T, D> a) {
   const SlotsInStrides slots(a);
   const int first = slots.first<D>();

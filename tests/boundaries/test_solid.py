@@ -327,6 +327,46 @@ def test_a_box_as_wide_as_the_domain_has_no_end_faces(device, dim, reach, walls)
         torch.testing.assert_close(after[tested], expected[tested], rtol=0, atol=1e-9)
 
 
+ALONG_WALLS = {
+    "floor": {},
+    "moves along the walls": {"velocity": (0.0, -0.4, 0.0)},
+    "moves into a wall": {"velocity": (0.5, -0.4, 0.3)},
+    "tilted": {"rotation": 1e-3},
+    "almost tilted": {"rotation": 1e-8},
+    "round": {},
+}
+
+
+@pytest.mark.parametrize(*in_pairs(walls=["slip", "separate", "mirror", "sticky"], form=list(ALONG_WALLS), dim=[2, 3]))
+def test_a_surface_between_walls_acts_as_torch_operations_have_it(device, dim, walls, form):
+    """The kernel skips the search for surfaces where the surface and its velocity are parallel to walls."""
+    options = dict(ALONG_WALLS[form])
+    if "velocity" in options:
+        options["velocity"] = options["velocity"][:dim]
+    if "rotation" in options and dim == 3:
+        options["rotation"] = (options["rotation"], 0.0, 0.7 * options["rotation"])
+    middle = (0.3, 0.287, 0.25)[:dim]  # No node is as near to both faces of the box.
+    if form == "round":  # A drum that turns about the last axis.
+        outline = [(0.15, -1.0), (0.15, 1.0), (0.4, 1.0), (0.4, -1.0)]
+        axis = {"axis": (0.0, 0.0, 1.0), "angular_velocity": (0.0, 0.0, 2.0)} if dim == 3 else {}
+        solid = mpm.Revolved(middle, outline, friction=0.4, **axis)
+    else:
+        solid = mpm.Box(middle, (3.0, 0.2, 3.0)[:dim], friction=0.4, **options)
+    grid = mpm.Grid(DX, (0.0,) * dim, (0.6, 0.6, 0.5)[:dim])
+    blocks = random_blocks(grid, device)
+    velocity = torch.randn(blocks.node_count, dim, dtype=torch.float64).to(device)
+    faces = mpm.Walls([walls if axis != 1 else "open" for axis in range(dim)])
+    x, upper = blocks.node_positions(torch.float64), (0.6, 0.6, 0.5)
+    for axis in range(dim):  # what the grid update leaves of the velocity there
+        if axis != 1:
+            beyond = (x[:, axis] <= 1e-9) | (x[:, axis] >= upper[axis] - 1e-9)
+            velocity[:, axis] = torch.where(beyond, 0, velocity[:, axis])
+    expected, found = in_torch(blocks, velocity, [solid], faces), contact(blocks, velocity, [solid], 0.0, faces)
+    active = blocks.active_nodes()
+    assert bool((expected[active] != velocity[active]).any())
+    torch.testing.assert_close(found[active], expected[active], rtol=0, atol=1e-7 if form == "almost tilted" else 1e-9)
+
+
 # ---- impulses and gradients
 
 
