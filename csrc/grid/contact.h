@@ -202,7 +202,7 @@ MPM_HD_CALL void find_surfaces(bool wanted, const SlotPoses<T, D>& poses, const 
 template <bool Exact = false, class T, int D>
 MPM_HD NodeTouch<T, D> touch_of_node(const SlotPoses<T, D>& poses, const Vector<T, D>& position) {
   if (poses.s.near == 0) return {};
-  Vector<T, D> sign;
+  Vector<T, D> sign = zero_vector<T, D>();
   const bool at_wall =
       !Exact && poses.s.walled && nearest_wall(poses.a, position) <= NearestSurface<T, D>::near_wall(poses.a);
   NearestSurface<T, D> nearest(poses.a, at_wall ? within_walls(poses.a, position, T(0), sign) : position);
@@ -423,7 +423,7 @@ MPM_HD void remember([[maybe_unused]] const ContactArguments<T, D>& a, [[maybe_u
 template <class T, int D>
 MPM_HD NodeTouch<T, D> lone_touch(const ContactArguments<T, D>& a, int scene, const int (&corner)[D], int local) {
   if (!acts_in(a, scene)) return {};
-  Vector<T, D> position = node_position(a, corner, local), sign;
+  Vector<T, D> position = node_position(a, corner, local), sign = zero_vector<T, D>();
   const bool at_wall = nearest_wall(a, position) <= NearestSurface<T, D>::near_wall(a);
   if (at_wall) position = within_walls(a, position, T(0), sign);
   NearestSurface<T, D> nearest(a, position);
