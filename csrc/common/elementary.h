@@ -24,8 +24,8 @@ MPM_HD double select(bool condition, double a, double b) { return condition ? a 
 MPM_HD float value_of(float x) { return x; }
 MPM_HD double value_of(double x) { return x; }
 
-// On a GPU in half turns: the reduction of large angles in radians needs local memory and registers, even where none
-// occurs. The error is that of x, half an ulp.
+// A GPU computes sines of half turns: the reduction of large angles in radians needs local memory and registers, even
+// where no angle is large. The two roundings of x / π add an error of at most an ulp of x.
 #ifdef __CUDA_ARCH__
 MPM_HD float sin(float x) { return ::sinpif(float(M_1_PI) * x); }
 MPM_HD double sin(double x) { return ::sinpi(M_1_PI * x); }

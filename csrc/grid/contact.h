@@ -112,8 +112,8 @@ class NearestSurface {
   // Faces and walls within this distance may join the nearest surface.
   MPM_HD T away() const { return 2 * SolidAt<T, D>::seam_of(a_) - nearest_; }
 
-  // Whether the nearest surface and its velocity are parallel to all walls that are near, and to mirrors that the node
-  // is behind. Contact with the surface alone keeps the velocity that the walls gave the node then.
+  // Whether the normal of the nearest surface and its velocity are parallel to all walls that are near, and to mirrors
+  // that the node is behind. Contact with the surface alone then keeps the velocity that the walls gave the node.
   MPM_HD bool is_along_walls(const Vector<T, D>* sign = nullptr) {
     constexpr double parallel = 1e-6;  // sine of the angle
     const T fastest = T(parallel) * length(touch_.velocity);

@@ -337,7 +337,7 @@ struct SandKernels : PrincipalKernels<Law> {
     const SandParameters<V> p = load_parameters<Energy, V>(at, a.law);
     const SandState<V, D> state = sand_state<Energy, V>(s, p, a.law);
 
-    // Scalars first: the strains need no registers in the products of matrices then.
+    // Scalars are stored first, so that strains need no registers during the products of matrices.
     if (a.branch) {
       const V branch = select(state.m.cone, V(kCone), select(state.m.apex, V(kApex), V(kElastic))) +
                        select(state.m.converged, V(0), V(kNotConverged));

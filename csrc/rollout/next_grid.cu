@@ -102,8 +102,8 @@ __device__ __noinline__ void add_contact(const NextGridArguments<T, D>& a, const
   }
 }
 
-// Blocks of a multiprocessor at least. Without obstacles the kernel waits for memory only: registers for more loads of
-// a thread cost more threads than they save.
+// Least number of blocks of a multiprocessor. Without obstacles the kernel waits for memory, and more threads hide that
+// better than more loads of each thread.
 template <bool Obstacles, class T>
 constexpr int kLeastBlocks = Obstacles ? (sizeof(T) == 4 ? 2 : 1) : (sizeof(T) == 4 ? 5 : 3);
 

@@ -136,7 +136,7 @@ def test_a_rollout_around_a_sampled_mesh_goes_in_one_op(device):
     grid = mpm.Grid(dx=0.05, lower=(0.0,) * 3, upper=(1.0,) * 3)
     points = mpm.seed.box((0.3, 0.68, 0.3), (0.7, 0.8, 0.7), grid)
     ends = []
-    for shape in (mesh, shapes.Sampled.of(mesh, (-0.3,) * 3, (0.3,) * 3, 0.025)):
+    for shape in (mesh, shapes.Sampled.of(mesh, (-0.3,) * 3, (0.3,) * 3, 0.0125)):
         body = mpm.boundaries.Obstacle(shape, (0.5, 0.5, 0.5), "separate", friction=0.2)
         step = mpm.Step(grid, mpm.NeoHookean(E=1e4, nu=0.3), (0.0, -9.8, 0.0), boundaries=[body])
         state = mpm.State.at_rest(points, velocity=(0.0, -2.0, 0.0), dtype=torch.float64, device=device)

@@ -301,6 +301,12 @@ def test_a_block_slides_over_seams(form):
     assert float(state.x[:, 1].min()) > -0.01
 
 
+def stop_at_sides(velocity: Tensor, x: Tensor, end: tuple[float, ...]) -> None:
+    """Set velocities into walls at 0 and `end`, on all axes but the second, to zero, as the grid update does."""
+    for axis in {*range(len(end))} - {1}:
+        velocity[(x[:, axis] <= 1e-9) | (x[:, axis] >= end[axis] - 1e-9), axis] = 0
+
+
 @pytest.mark.thorough(dim=3)
 @pytest.mark.parametrize("reach", [0.0, 0.3, 3.0, -0.05])
 @pytest.mark.parametrize("walls", ["slip", "separate", "mirror"])
@@ -318,11 +324,8 @@ def test_a_box_as_wide_as_the_domain_has_no_end_faces(device, dim, reach, walls)
     expected[:, 1] = torch.where(x[:, 1] <= 0.5 + 1e-9, velocity[:, 1].clamp_min(0), velocity[:, 1])
     sides = [walls if axis != 1 else "open" for axis in range(dim)]
     faces = mpm.Walls(sides)
-    for axis in range(dim):  # what the grid update leaves of the velocity there
-        if axis != 1:
-            beyond = (x[:, axis] <= 1e-9) | (x[:, axis] >= end[axis] - 1e-9)
-            velocity[:, axis] = torch.where(beyond, 0, velocity[:, axis])
-            expected[:, axis] = torch.where(beyond, 0, expected[:, axis])
+    stop_at_sides(velocity, x, end)
+    stop_at_sides(expected, x, end)
     for after in (contact(blocks, velocity, [floor], 0.0, faces), in_torch(blocks, velocity, [floor], faces)):
         torch.testing.assert_close(after[tested], expected[tested], rtol=0, atol=1e-9)
 
@@ -352,15 +355,11 @@ def test_a_surface_between_walls_acts_as_torch_operations_have_it(device, dim, w
         solid = mpm.Revolved(middle, outline, friction=0.4, **axis)
     else:
         solid = mpm.Box(middle, (3.0, 0.2, 3.0)[:dim], friction=0.4, **options)
-    grid = mpm.Grid(DX, (0.0,) * dim, (0.6, 0.6, 0.5)[:dim])
-    blocks = random_blocks(grid, device)
+    end = (0.6, 0.6, 0.5)[:dim]
+    blocks = random_blocks(mpm.Grid(DX, (0.0,) * dim, end), device)
     velocity = torch.randn(blocks.node_count, dim, dtype=torch.float64).to(device)
     faces = mpm.Walls([walls if axis != 1 else "open" for axis in range(dim)])
-    x, upper = blocks.node_positions(torch.float64), (0.6, 0.6, 0.5)
-    for axis in range(dim):  # what the grid update leaves of the velocity there
-        if axis != 1:
-            beyond = (x[:, axis] <= 1e-9) | (x[:, axis] >= upper[axis] - 1e-9)
-            velocity[:, axis] = torch.where(beyond, 0, velocity[:, axis])
+    stop_at_sides(velocity, blocks.node_positions(torch.float64), end)
     expected, found = in_torch(blocks, velocity, [solid], faces), contact(blocks, velocity, [solid], 0.0, faces)
     active = blocks.active_nodes()
     assert bool((expected[active] != velocity[active]).any())

@@ -99,7 +99,7 @@ def _read_npz(path: Path, dim: int | None) -> PointFile:
 
 
 def arrays_of(path: Path, *names: str) -> dict[str, Array]:
-    """Those of some arrays that an .npz file has, float64.
+    """Arrays of an .npz file by name, float64; names that the file lacks are skipped.
 
     Raises:
         zipfile.BadZipFile, ValueError: for a damaged file, or an array that holds no numbers or does not fit in memory.

@@ -337,7 +337,7 @@ class InvariantFullMetaPlasticity(_InvariantFull, _NetworkPlasticity):
 
 
 class _Unavailable(Material):
-    """Raises: a law of NCLaw that is not symmetric in the stretches, so that it has no gradient at F = I.
+    """A law of NCLaw that is not available: it is not symmetric in the stretches, and has no gradient at F = I.
 
     Raises:
         NotImplementedError: always.

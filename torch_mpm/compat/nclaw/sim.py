@@ -218,7 +218,7 @@ class MPMForwardSim(MPMSim):
 
 
 class MPMExtraSim(MPMSim):
-    """Raises: positions of further particles that the velocities of the nodes move.
+    """Simulation of further particles that the velocities of nodes move, which is not available.
 
     Raises:
         NotImplementedError: always.

@@ -69,7 +69,7 @@ def _ranges(values: Array) -> Array:
 
 
 def _quantised(values: Array, ranges: Array, bits: int) -> Array:
-    """uint32 [P, D]"""
+    """Whole numbers of some bits for values in ranges, uint32 [P, D]."""
     low, high = ranges.astype(np.float64).T
     return ((values - low) / (high - low) * (2**bits - 1) + 0.499).astype(np.uint32)
 
