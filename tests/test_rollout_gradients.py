@@ -91,9 +91,12 @@ def test_transfers(transfer, form, law, dtype, kernel, device):
     assert_same(gradients(in_op(2), step, state), gradients(single(), step, state), tolerance)
 
 
-@pytest.mark.parametrize(*in_pairs(transfer=TRANSFERS, walls=WALLS, n=[1, 40], dim=[2, 3]))
-def test_walls(transfer, walls, n, dim, device):
+@pytest.mark.parametrize(*in_pairs(transfer=TRANSFERS, walls=WALLS, n=[1, 40], dim=[2, 3], damping=[1.0, 0.8]))
+def test_walls(transfer, walls, n, dim, damping, device):
     options = {"walls": touched(walls, dim), **TRANSFERS[transfer]}
+    if damping < 1:
+        ball = mpm.Sphere((0.5,) * dim, 0.2, velocity=(1.0,) + (0.0,) * (dim - 1), friction=0.3)
+        options["boundaries"] = [mpm.boundaries.Damping(damping), ball]
     step = mpm.Step(unit_box(dim), with_gradients(mpm.NeoHookean(E=1e4, nu=0.3)), pulled(dim), **options).to(device)
     state = moving(step, blob(device, dim))
     assert_same(gradients(in_op(ALL, n), step, state), gradients(single(n), step, state))

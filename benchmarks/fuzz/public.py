@@ -441,9 +441,17 @@ def _boundaries() -> dict[str, Callable[[], Call]]:
     def distance(x: torch.Tensor) -> torch.Tensor:
         return x.norm(dim=-1) - 0.1
 
+    def damping() -> Call:
+        def use(**arguments: Any) -> Any:
+            w = _World()
+            return mpm.Step(w.grid, w.law, boundaries=[mpm.boundaries.Damping(**arguments)])(w.state, 1e-4)
+
+        return use, dict(share=0.9)
+
     centre = dict(position=(0.5, 0.5), kind="slip")
     return {
         "Walls": walls,
+        "Damping": damping,
         "Plane": applied(mpm.Plane, **centre, normal=(0.0, 1.0)),
         "Sphere": applied(mpm.Sphere, **centre, radius=0.2),
         "Box": applied(mpm.Box, **centre, size=(0.2, 0.2)),

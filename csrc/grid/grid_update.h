@@ -9,7 +9,7 @@
 #include "grid/impulse.h"
 #include "grid/lattice_node.h"
 
-// Node momentum to node velocity, gravity and the walls of the domain.
+// Node momentum to node velocity, gravity, the walls of the domain and damping.
 //
 // A mirror makes its plane one of symmetry: node values are those of the particles together with their images behind
 // the plane. Mass and momentum (gravity included) of a node and, reflected, of its image are summed; both nodes
@@ -61,6 +61,7 @@ struct GridUpdateArguments {
   const T* scene_dt = nullptr;  // [scenes], or null; the time step of a scene is dt * scene_dt[scene]
   double dt = 0;
   Walls<T, D> walls;
+  T damping = 1;  // share of the velocities after the walls that is left
   NodeRow<T, D>* updated = nullptr;
 };
 
@@ -235,7 +236,7 @@ MPM_HD NodeRow<T, D> update_node(const GridUpdateArguments<T, D>& a, const SlotU
     const auto see = [](int, const Vector<T, D>&, const Vector<T, D>&) {};
     v = after_walls(a.walls, lattice_node<D>(s.corner, local), v, see);
   }
-  return {row.mass, v};
+  return {row.mass, a.damping * v};
 }
 
 // The mirror that receives a component of the momentum of a lattice node, or -1 for none: that along the axis, or
@@ -311,6 +312,7 @@ MPM_HD Vector<T, D> shared_adjoint(const GridUpdateBackwardArguments<T, D>& b, c
         grad[i] += sign[i] * b.grad_updated[member].value[i];
     });
   }
+  grad = b.forward.damping * grad;
   NoImpulses none;
   return s.walled ? walls_adjoint(b.forward.walls, lattice_node<D>(s.corner, local), free, grad, none) : grad;
 }
@@ -325,7 +327,7 @@ MPM_HD Vector<T, D> shared_adjoint(const GridUpdateBackwardArguments<T, D>& b, c
   bool itself = true;  // the node comes first; it may be its own image
   const auto add_member = [&](int64_t member, const Vector<T, D>& sign, const Vector<int, D>& node) {
     auto on_boundaries = impulses(s.scene, member);
-    Vector<T, D> grad = b.grad_updated[member].value, v, direct = zero_vector<T, D>();
+    Vector<T, D> grad = a.damping * b.grad_updated[member].value, v, direct = zero_vector<T, D>();
     MPM_UNROLL for (int i = 0; i < D; i++)
       v[i] = sign[i] * free[i];
     grad = walls_adjoint(a.walls, node, v, grad, on_boundaries);

@@ -31,7 +31,7 @@ namespace mpm {
   X(INT, n, n)                                  \
   X(FLOAT, dt, dt)                              \
   X(BOOL, apic, apic)                           \
-  X(FLOAT, flip, flip)                          \
+  X(FLOATS, velocity_shares, velocity_shares)   \
   X(BOOL, wants_C, wants_C)                     \
   X(INT, stress_form, stress_form)              \
   X(OPTIONAL, gravity, gravity)                 \
@@ -104,6 +104,16 @@ namespace mpm {
 // The arguments of a call.
 struct SubstepsInputs {
   MPM_SUBSTEPS_LIST(MPM_DECLARE_MEMBER, MPM_DECLARE_MEMBER)
+  // Share of the particles' own velocities that FLIP adds, and that of node velocities which damping leaves.
+  double flip() const { return velocity_share(0); }
+  double damping() const { return velocity_share(1); }
+  double velocity_share(size_t k) const {
+    STD_TORCH_CHECK(velocity_shares.size() == 2, "velocity_shares must have 2 entries, those of FLIP and damping, got ",
+                    velocity_shares.size());
+    const double share = velocity_shares[k];
+    STD_TORCH_CHECK(share >= 0 && share <= 1, "velocity_shares must be between 0 and 1, got ", share);
+    return share;
+  }
   PackedLattice lattice{lattice_numbers, lattice_layout};
 };
 

@@ -100,7 +100,7 @@ struct Substeps {
     advance.residual_next = p.residual;
   }
 
-  bool flips() const { return in.flip > 0; }
+  bool flips() const { return in.flip() > 0; }
 
   // Velocities of the particles minus those of the nodes before the forces; FLIP adds its share of them after G2P. Uses
   // the nodes of the pool, before P2G does.
@@ -118,7 +118,7 @@ struct Substeps {
     backend::add_scaled(AddScaledArguments<T, D>{in.x.size(0), to, particles.velocity, constant(to), -1}, stream);
   }
 
-  // Computes the nodes, zero on entry, and their velocities before the forces and all boundaries except mirrors;
+  // Computes the nodes, zero on entry, and their velocities before the forces and all boundaries except mirrors, without damping;
   // returns the arguments of the update.
   GridUpdateArguments<T, D> find_nodes_before(P2GArguments<T, D> particles, T* nodes, NodeRow<T, D>* updated,
                                               backend::Stream stream) const {
@@ -127,6 +127,7 @@ struct Substeps {
     backend::p2g(in.lattice.order(), particles, stream);
     GridUpdateArguments<T, D> a = update;
     a.gravity = nullptr;
+    a.damping = 1;
     a.walls = mirrors(update.walls);
     a.nodes = reinterpret_cast<const NodeRow<T, D>*>(nodes);
     a.updated = updated;
@@ -137,7 +138,7 @@ struct Substeps {
   // Adds the share of FLIP to the velocities after G2P.
   void add_flip(const Field<const T>& velocities, backend::Stream stream) {
     const Field<T>& v = advance.gather.value;
-    backend::add_scaled(AddScaledArguments<T, D>{in.x.size(0), v, constant(v), velocities, in.flip}, stream);
+    backend::add_scaled(AddScaledArguments<T, D>{in.x.size(0), v, constant(v), velocities, in.flip()}, stream);
   }
 
   // Finds the active blocks; false if the pool has no room for them and must not grow. On CUDA the result is true
@@ -356,7 +357,6 @@ template <class T, int D>
 Substeps<T, D>::Substeps(const SubstepsInputs& inputs) : in(inputs) {
   STD_TORCH_CHECK(in.n > 0 && in.n <= kMostSteps, "n must be 1 to ", kMostSteps, ", got ", in.n);
   STD_TORCH_CHECK(in.dt > 0 && std::isfinite(in.dt), "dt must be positive and finite, got ", in.dt);
-  STD_TORCH_CHECK(in.flip >= 0 && in.flip <= 1, "flip must be between 0 and 1, got ", in.flip);
   STD_TORCH_CHECK(in.wants_C || !in.apic, "apic needs wants_C");
   activation = activate_arguments<T, D>(in.lattice, in.x, in.scene, in.ids, in.scenes, in.max_blocks);
   if (has(in.previous_status))
@@ -369,7 +369,8 @@ Substeps<T, D>::Substeps(const SubstepsInputs& inputs) : in(inputs) {
   if (has(in.impulse)) {
     check_shape(*in.impulse, "impulse", impulse_shape());
     check_type(*in.impulse, "impulse", ScalarType::Double, in.x);
-    STD_TORCH_CHECK(!flips() || !update.walls.mirrored, "impulses on mirrors are not counted with flip, got ", in.flip);
+    STD_TORCH_CHECK(!flips() || !update.walls.mirrored, "impulses on mirrors are not counted with flip, got ", in.flip());
+    STD_TORCH_CHECK(in.damping() == 1, "impulses are not counted with damping, got ", in.damping());
   }
   facts = facts_of_call();
 }
@@ -416,6 +417,7 @@ void Substeps<T, D>::set_grid_update() {
   update.geometry = activation.geometry;
   update.block_count = activation.scenes * activation.geometry.blocks_per_scene;
   update.walls = walls<T, D>(in.wall_kind, in.wall_plane, in.wall_friction, in.lattice);
+  update.damping = T(in.damping());
   if (!has(in.gravity)) return;
   check_shape(*in.gravity, "gravity", {in.scenes, D});
   check_like(*in.gravity, "gravity", in.x);

@@ -288,7 +288,7 @@ void SubstepsBackward<T, D>::backward_grid(int64_t i, Adjoints& adjoints, const 
 template <class T, int D>
 void SubstepsBackward<T, D>::keep_adjoint(const Adjoints& adjoints) {
   const Field<const T> v = field<const T>(adjoints.v);
-  backend::add_scaled(AddScaledArguments<T, D>{in_.x.size(0), field<T>(kept_), {}, v, -in_.flip}, stream_);
+  backend::add_scaled(AddScaledArguments<T, D>{in_.x.size(0), field<T>(kept_), {}, v, -in_.flip()}, stream_);
 }
 
 // Adjoint of FLIP's share, through the velocities of the particle and of the nodes before the forces. The remaining

@@ -168,7 +168,7 @@ def test_gradients_are_those_of_the_published_step(run, name):
 
 @pytest.mark.parametrize(
     ("damping", "scale", "words"),
-    [(0.35, 1.0, "on_particles, DampedAffine"), (0.0, 0.9, "torch operations, NodeDamping")],
+    [(0.35, 1.0, "on_particles, DampedAffine"), (0.0, 0.9, "torch operations, Damping")],
 )
 def test_explain_names_what_acts_step_by_step(damping, scale, words):
     sim = simulator("physgaussian", damping, scale)

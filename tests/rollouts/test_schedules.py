@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from cases.rollouts import LAWS_HERE, TRANSFERS, WALLS, assert_equal
+from cases.rollouts import LAWS_HERE, TRANSFERS, WALLS, assert_equal, one_by_one
 from pairs import in_pairs
 
 import torch_mpm as mpm
@@ -39,10 +39,12 @@ def obstacles_of(kind: str, dim: int) -> list[mpm.Obstacle]:
     return []
 
 
-def made(law: str, transfer: str, walls: str, obstacles: str, device: str) -> tuple[mpm.Step, mpm.State]:
+def made(
+    law: str, transfer: str, walls: str, obstacles: str, device: str, damping: float = 1.0
+) -> tuple[mpm.Step, mpm.State]:
     """In 2-D or 3-D, in turn."""
     dim = 2 + (list(LAWS).index(law) + list(TRANSFERS).index(transfer) + WALLS.index(walls)) % 2
-    boundaries = obstacles_of(obstacles, dim)
+    boundaries = [*([mpm.boundaries.Damping(damping)] * (damping < 1)), *obstacles_of(obstacles, dim)]
     options = {"boundaries": boundaries, "gravity": (0.0, -9.8, 0.0)[:dim], **TRANSFERS[transfer]}
     step = mpm.Step(unit_box(dim), LAWS[law](), walls=touched(walls, dim), **options)
     state = blob(device, dim, dtype=torch.float32)
@@ -53,12 +55,22 @@ def made(law: str, transfer: str, walls: str, obstacles: str, device: str) -> tu
 
 @torch.no_grad()
 @pytest.mark.parametrize(
-    *in_pairs(law=LAWS, transfer=TRANSFERS, walls=WALLS, obstacles=["none", "sphere", "corner", "late corner"])
+    *in_pairs(
+        law=LAWS,
+        transfer=TRANSFERS,
+        walls=WALLS,
+        obstacles=["none", "sphere", "corner", "late corner"],
+        damping=[1.0, 0.95],
+    )
 )
-def test_schedules_agree(law, transfer, walls, obstacles, device):
+def test_schedules_agree(law, transfer, walls, obstacles, damping, device):
+    """Damped steps are also compared with those of a loop in Python."""
     expected = None
+    if damping < 1:
+        step, state = made(law, transfer, walls, obstacles, device, damping)
+        expected = one_by_one(step, state, STEPS, DT)
     for schedule in SCHEDULES:
-        step, state = made(law, transfer, walls, obstacles, device)
+        step, state = made(law, transfer, walls, obstacles, device, damping)
         if not serves(schedule, device, law, transfer, walls):
             with pytest.raises(ValueError, match=f"^schedule must be one that supports the call, got {schedule}: .+"):
                 mpm.rollout(step, state, STEPS, DT, schedule=schedule)

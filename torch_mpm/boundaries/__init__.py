@@ -1,4 +1,5 @@
-"""Boundaries, which change the velocity of grid nodes: the walls of the domain, and obstacles that may move.
+"""Boundaries, which change the velocity of grid nodes: the walls of the domain, obstacles that may move, and
+damping.
 
 The list of boundaries of a `Step` may contain any `nn.Module` with the arguments below, or any object with a method
 `apply` of these arguments. It is ordinary torch code on the nodes, differentiated by autograd. This one accelerates the
@@ -15,6 +16,7 @@ The step finds the parameters of modules, and so does an optimizer that is given
 Choose with `torch.where` rather than a mask as index, which synchronises with the device.
 """
 
+from .damping import Damping
 from .list import BoundaryList, call_boundary
 from .motion import Pose, rotation_matrix
 from .obstacles import SDF, Box, Capsule, Obstacle, Plane, Revolved, Sphere
@@ -29,6 +31,7 @@ __all__ = [
     "BoundaryList",
     "Box",
     "Capsule",
+    "Damping",
     "Face",
     "Obstacle",
     "Plane",

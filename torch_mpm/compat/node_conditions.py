@@ -63,19 +63,6 @@ def outer_planes(dx: float, cells: Sequence[int], padding: int, start: float, en
     return planes
 
 
-class NodeDamping(TensorModule):
-    """Multiplies the velocity of all nodes in every step by a number, or a tensor [] that may require grad, up to 1."""
-
-    reads_time = False
-
-    def __init__(self, scale: float | Tensor) -> None:
-        self.scale = scale
-
-    def forward(self, velocity: Tensor, positions: Tensor, scene: Tensor | None, time: float, dt: float) -> Tensor:
-        scale = self.scale.clamp(max=1) if isinstance(self.scale, Tensor) else min(self.scale, 1.0)
-        return scale * velocity
-
-
 class FreezeOutside(nn.Module):
     """Stops all nodes before `start`, and for some steps from `end` on."""
 

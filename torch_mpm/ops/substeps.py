@@ -1,8 +1,8 @@
 """Ops behind `torch_mpm.rollout`: n steps in one call, and their adjoint. Fake kernels and autograd.
 
     torch.ops.torch_mpm.substeps(x, v, mass, volume, C, F, J, residual, history, scene, ids, material, previous_status,
-        laws, options, parameters, variables, n, dt, apic, flip, wants_C, stress_form, gravity, wall_kind, wall_plane,
-        wall_friction, obstacles, data, shape, sizes, contact, obstacle_scene, start, end, time, scenes,
+        laws, options, parameters, variables, n, dt, apic, velocity_shares, wants_C, stress_form, gravity, wall_kind,
+        wall_plane, wall_friction, obstacles, data, shape, sizes, contact, obstacle_scene, start, end, time, scenes,
         max_blocks, grows, resident, records, impulse, scene_dt, scene_time, heat, heat_options, heat_scalars,
         held_obstacles, heat_terms, heat_boundaries, thermal, tables, lattice, layout, schedule=-1)
         -> (x, v, C, F, J, history, status, impulse, time, residual, heat, heat_status, record)
@@ -15,14 +15,16 @@ stress is added; their options, parameters and history variables are concatenate
 for each law. The time step dt [s] is one of the parameters of rate-dependent laws. `obstacles` is the table of
 `contact`, or one for each substep [n, 1 or B, K, width] with the positions at its time. Absent results are None;
 `history` has the entries of all laws side by side, [P, m]. The impulses on obstacles and walls are added to `impulse`,
-where it is given. With `flip` that share of the velocities of particles, minus those of the nodes before the forces, is
-added to the result of G2P. Scenes with separate clocks have the time steps dt times `scene_dt` and begin at
-`scene_time`, both [B], the latter in float64. With `grows` the pool grows with the scene on the CPU; otherwise the op
-stops on the CPU where it is full, and the status reports it. On CUDA the host waits only to stay less than a fraction
-of a second ahead of the device. With `resident` batches of small scenes may be computed on CUDA by one thread block per
-scene; sums, also those of gradients, may then round differently. With `records` all inputs of the adjoint are stored in
-`record`, opaque bytes, and no step is recomputed, except where impulses are counted or the pool had to grow. `residual`
-is `State.x_residual`; without it positions are not compensated.
+where it is given. `velocity_shares` are two numbers from 0 to 1. The first is the share of FLIP: of the velocities of
+particles, minus those of the nodes before the forces, it is added to the result of G2P. The second is the share of node
+velocities that damping leaves after the walls and before the obstacles, 1 without damping. Scenes with separate clocks
+have the time steps dt times `scene_dt` and begin at `scene_time`, both [B], the latter in float64. With `grows` the
+pool grows with the scene on the CPU; otherwise the op stops on the CPU where it is full, and the status reports it. On
+CUDA the host waits only to stay less than a fraction of a second ahead of the device. With `resident` batches of small
+scenes may be computed on CUDA by one thread block per scene; sums, also those of gradients, may then round differently.
+With `records` all inputs of the adjoint are stored in `record`, opaque bytes, and no step is recomputed, except where
+impulses are counted or the pool had to grow. `residual` is `State.x_residual`; without it positions are not
+compensated.
 
 Heat is conducted where `heat` is not empty, without gradients: temperature [P], conductivity and
 specific heat; for materials that melt also liquid fraction [P], melting point and latent heat; and last, for the first
@@ -55,7 +57,7 @@ Several times a second both ops run the handlers of signals, on the main thread.
 with a RuntimeError and without a result; `torch_mpm.rollout` raises the exception of the handler.
 
 Differentiable once, with respect to x, v, mass, volume, C, F, J, history, parameters, gravity, obstacles, impulse and
-scene_dt, the last without flip and without the dependence of obstacles on the time. Autograd stores the arguments of a
+scene_dt, the last without FLIP and without the dependence of obstacles on the time. Autograd stores the arguments of a
 call and the record, if any: 2 D + 2 D² numbers per particle of a solid (24 in 3-D) and its history.
 
     torch.ops.torch_mpm.substeps_backward(grad_x, grad_v, grad_C, grad_F, grad_J, grad_history, grad_impulse, needs,

@@ -102,7 +102,7 @@ def facts_of(steps: Steps, state: State, stores_all: bool = False) -> Facts:
         is_captured(x),
         graph_loops(),
         path_bytes,
-        len(step.boundaries.entries),
+        len(_obstacles(step)),
         step.heat is not None,
     )
 

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..boundaries.damping import split_damping
 from ..heat.boundaries import (
     STEFAN_BOLTZMANN,
     Convection,
@@ -115,7 +116,7 @@ def _held(step: Step, x: Tensor) -> tuple[list[int], int, Tensor]:
     terms = sorted(held, key=lambda term: type(term) is FixedSurface)
     if not terms:
         return [], 0, x.new_empty(0)
-    scenes, obstacles = step.grid.scenes, step.boundaries.entries
+    scenes, (_, obstacles) = step.grid.scenes, split_damping(step.boundaries.entries)
     numbers = [next(k for k, o in enumerate(obstacles) if o is term.region) for term in terms]
     rows = [_of_scenes(term.temperature, x, scenes) for term in terms]
     return numbers, int(type(terms[-1]) is FixedSurface), torch.stack(rows)

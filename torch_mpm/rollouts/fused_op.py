@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..boundaries.damping import split_damping
 from ..errors import check_count, check_flag, shape_of
 from ..grid.topology import Status
 from ..laws.calls import law_calls
@@ -134,7 +135,8 @@ def _arguments(
     schedule: str | None = None,
 ) -> tuple[tuple[Any, ...], list[list[str]]]:
     """Arguments of the op in its order, and the names of the history of each law, for a prepared state."""
-    grid, law, boundaries = step.grid, step.law, step.boundaries.entries
+    grid, law = step.grid, step.law
+    damping, boundaries = split_damping(step.boundaries.entries)
     number, scene_dt, scene_time = clocks(state, dt, grid.scenes)
     times = StepTimes.of(state, n, dt, grid.scenes) if boundaries and follows_paths(step) else None
     pool = grid.pool(state.x, state.scene)
@@ -150,7 +152,7 @@ def _arguments(
         None if state.x_residual is None else state.x_residual.detach(),
         *(calls.history, state.scene, state.ids, calls.material, step._error_status.status_for(state.x)),
         *(",".join(calls.names), calls.options, calls.parameters, calls.variables),
-        *(int(n), number, apic, step._flip_share, wants_C, STRESS_FORMS[step.stress_form]),
+        *(int(n), number, apic, (step._flip_share, damping), wants_C, STRESS_FORMS[step.stress_form]),
         _gravity(step, state.x),
         *wall_arguments(step.walls, grid),
         *(table, *others),

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from ..boundaries import Obstacle
+from ..boundaries.damping import split_damping
 from ..cuda_graphs.capture import (
     NUMBERS,
     CapturedGraphs,
@@ -70,10 +71,13 @@ def why_not_fused(step: Any, state: State, n: int, dt: float | Tensor) -> str | 
         return reason
     if any([has_hooks(module) for module in (step, *modules_in(law))]):
         return "there are hooks"
-    others = [b for b in boundaries.entries if not (isinstance(b, Obstacle) and fusible(b, 0.0, paths=True))]
+    damping, obstacles = split_damping(boundaries.entries)
+    if damping != 1 and state.impulse is not None:
+        return "impulses on boundaries are counted, of which damping is one"
+    others = [b for b in obstacles if not (isinstance(b, Obstacle) and fusible(b, 0.0, paths=True))]
     if others:
         return f"a boundary acts by torch operations, {type(others[0]).__name__}"
-    if len(boundaries.entries) > MAX_OBSTACLES:
+    if len(obstacles) > MAX_OBSTACLES:
         return f"there are more than {MAX_OBSTACLES} obstacles"
     if torch.is_grad_enabled() and any(part.has_functions for part in laws):
         return "a parameter is a function, which may have a gradient"

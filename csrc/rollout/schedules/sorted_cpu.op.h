@@ -28,7 +28,7 @@ class SortedCpu {
   // - heat, whose solve is between G2P and the next step.
   static bool may_last(const SubstepsInputs& in) {
     return in.lattice.order() == 2 && in.n > kLeastLastingSteps && !in.lattice.deterministic() &&
-           (in.grows || in.resident) && in.flip == 0 && !HeatSteps<T, D>::wanted(in);
+           (in.grows || in.resident) && in.flip() == 0 && !HeatSteps<T, D>::wanted(in);
   }
 
   // One substep, with `following` further ones; false as for `Substeps::activate`.

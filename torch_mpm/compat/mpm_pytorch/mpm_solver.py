@@ -9,15 +9,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ...boundaries import Damping
 from ...boundaries.apply import after_boundaries
 from ...errors import check_count, check_like, check_number, shape_of
 from ...grid.grid import Blocks, Grid
 from ...state.state import State
 from ...step.particle_operations import Operations
 from ...step.step import Step
-from ..given_stress import GivenStress, clamped, stepped
+from ..given_stress import GivenStress, GivenStressSteps, Particles, clamped
 from ..gradients import Numbers, check_fixed, refuse_grad, vector
-from ..node_conditions import NodeDamping
 from .call_times import CallTimes, is_recomputed
 from .user_functions import Written, dense, replaced, writes_grid, writes_particles
 
@@ -96,6 +96,7 @@ class MPMSolver:
         self.displacement: Tensor | None = None
         self._times = CallTimes()
         self.step = Step(Grid(self.dx, (0.0,) * 3, (1.0,) * 3), GivenStress(), stress_form="gradient")
+        self._steps = GivenStressSteps(self.step)
         self.gravity = gravity
         self._acting: tuple[list[Any], list[Any]] | None = None
         self._changes = 0  # Lengths of the lists of conditions.
@@ -146,15 +147,22 @@ class MPMSolver:
         self.displacement, self._now = None, time
         self._last, self._nodes = (x, v, C, F, stress, time), None
         volume, mass = (self._of_particles(name, getattr(self, name), x) for name in ("vol", "p_mass"))
-        state = stepped(self.step, x, v, C, F, stress, mass, volume, time, self.dt)
-        assert state.C is not None and state.F is not None
-        # Weights are those of the positions before they are displaced, as in MPM-PyTorch.
-        after = state.x if self.displacement is None else state.x + self.displacement
-        after = clamped(after, self.clip_bound, 1 - self.clip_bound)
-        result = after, state.v, state.C, clamped(state.F, -LARGEST_ENTRY, LARGEST_ENTRY)
+        result = self._steps(
+            *((x, v, C, F), stress, mass, volume, time, self.dt, self._ended),
+            None if any(self._acting or ()) or self._shows else (self.clip_bound, self.vol, self.p_mass),
+        )
         if recomputed:
             self._times.store(result, (time + self.dt, self._changes))
         return result
+
+    def _ended(self, state: State) -> Particles:
+        """Particles after a step, clamped. Weights are those of the positions before they are displaced, as in
+        MPM-PyTorch.
+        """
+        assert state.C is not None and state.F is not None
+        after = state.x if self.displacement is None else state.x + self.displacement
+        after = clamped(after, self.clip_bound, 1 - self.clip_bound)
+        return after, state.v, state.C, clamped(state.F, -LARGEST_ENTRY, LARGEST_ENTRY)
 
     def _recomputed_time(self, arguments: tuple[Tensor, ...]) -> float:
         """Time of the recomputed call; that of the solver where no condition depends on it."""
@@ -195,7 +203,7 @@ class MPMSolver:
         self._acting = lists
         operations = [Written(self, o) if writes_particles(o) else o for o in lists[0]]
         self.step.on_particles = Operations(operations) if operations else None
-        damping = [NodeDamping(self.damping)] if self.damping < 1 else []
+        damping = [Damping(self.damping)] if self.damping < 1 else []
         self.step.on_grid = self._on_dense_grid if on_dense_grid else None
         self.step.boundaries = damping if on_dense_grid else [*damping, *lists[1]]  # type: ignore[assignment]
 

@@ -9,12 +9,13 @@ import torch
 from torch import Tensor, nn
 
 from ...boundaries import Walls
+from ...cuda_graphs.capture import DeviceConstantCache
 from ...errors import check_count, check_number, shape_of
 from ...grid.grid import Blocks, Grid
 from ...laws.parameters import TensorModule
 from ...state.state import State
 from ...step.step import Step
-from ..given_stress import GivenStress, clamped, stepped
+from ..given_stress import GivenStress, GivenStressSteps, Particles, clamped
 from ..gradients import Numbers, check_fixed, refuse_grad, vector
 from ..settings import setting
 from .particles import MPMInitData, MPMState, MPMStateInitializer, MPMStatics, MPMStaticsInitializer
@@ -32,9 +33,6 @@ __all__ = [
     "MPMStatics",
     "MPMStaticsInitializer",
 ]
-
-Particles = tuple[Tensor, Tensor, Tensor, Tensor]
-"""State of x, v, C and F."""
 
 
 class MPMModel:
@@ -70,23 +68,28 @@ class MPMModel:
             step.walls = Walls("separate", (lower,) * 3, (upper,) * 3) if bound > 0 else None
         else:
             step.on_grid = HeavyNodes(eps, self.gravity, lower, upper)
-        self.step = step
-        self._enabled: Tensor | None = None
+        self.step, self._steps = step, GivenStressSteps(step)
+        self._statics: MPMStatics | None = None
 
     def _present(self, state: State, dt: float | Tensor) -> tuple[State, Tensor]:
-        assert self._enabled is not None
-        return state, self._enabled
+        assert self._statics is not None
+        return state, self._statics.enabled.to(state.x.device) != 0
 
     def advance(self, statics: MPMStatics, x: Tensor, v: Tensor, C: Tensor, F: Tensor, stress: Tensor) -> Particles:
         """Particles a time step later. Particles that are not enabled are unchanged."""
         if not isinstance(statics, MPMStatics):
             raise TypeError(f"statics must be an MPMStatics, got {shape_of(statics)}")
         volume = statics.vol.to(x)
-        self._enabled = statics.enabled.to(x.device) != 0
-        state = stepped(self.step, x, v, C, F, stress, statics.rho.to(x) * volume, volume, 0.0, self.dt)
-        margin = statics.clip_bound.to(x)[:, None] * self.dx
-        after = torch.where(self._enabled[:, None], clamped(state.x, margin, 1 - margin), x)
-        assert state.C is not None and state.F is not None
+        mass, read = statics.rho.to(x) * volume, (statics.vol, statics.rho, statics.enabled, statics.clip_bound)
+        self._statics = statics
+        return self._steps((x, v, C, F), stress, mass, volume, 0.0, self.dt, self._ended, read)
+
+    def _ended(self, state: State) -> Particles:
+        """Particles after a step, with positions clamped except those of particles that are not enabled."""
+        assert self._statics is not None and state.C is not None and state.F is not None
+        margin = self._statics.clip_bound.to(state.x)[:, None] * self.dx
+        _, enabled = self._present(state, self.dt)
+        after = torch.where(enabled[:, None], clamped(state.x, margin, 1 - margin), state.x)
         return after, state.v, state.C, state.F
 
     def state(self, shape: int, requires_grad: bool | None = None) -> MPMState:
@@ -109,18 +112,24 @@ class HeavyNodes(TensorModule):
 
     def __init__(self, eps: float, gravity: Numbers, lower: float, upper: float) -> None:
         self.eps, self.gravity, self.lower, self.upper = eps, gravity, lower, upper
+        self._constants = DeviceConstantCache()
 
     def forward(self, blocks: Blocks, velocity: Tensor, mass: Tensor, dt: float) -> Tensor:
-        share = mass / (mass + self.eps)
-        rounding = 1e-6 * blocks.grid.dx
-        columns = []
-        for v, g, x in zip(
-            velocity.unbind(1), self.gravity, blocks.node_positions(velocity.dtype).unbind(1), strict=True
-        ):
-            v = share * v + g * dt
-            out = ((x <= self.lower + rounding) & (v < 0)) | ((x >= self.upper - rounding) & (v > 0))
-            columns.append(torch.where(out, 0, v))
-        return torch.stack(columns, 1)
+        gravity, x, rounding = (
+            self._gravity_like(velocity),
+            blocks.node_positions(velocity.dtype),
+            1e-6 * blocks.grid.dx,
+        )
+        v = (mass / (mass + self.eps))[:, None] * velocity + gravity * dt
+        out = ((x <= self.lower + rounding) & (v < 0)) | ((x >= self.upper - rounding) & (v > 0))
+        return torch.where(out, 0, v)
+
+    def _gravity_like(self, velocity: Tensor) -> Tensor:
+        if isinstance(self.gravity, Tensor):
+            return self.gravity.to(velocity)
+        key = velocity.dtype, velocity.device, *self.gravity
+        tensor: Tensor = self._constants.get(key, lambda: velocity.new_tensor(list(self.gravity)), velocity)
+        return tensor
 
 
 class MPMModelBuilder:

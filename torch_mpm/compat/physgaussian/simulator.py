@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ...boundaries import Damping
 from ...errors import check_count, check_flag, check_like, shape_of
 from ...laws import Material
 from ...state.state import State, identity_deformation
@@ -16,7 +17,6 @@ from ..clipping import ClippedRollout
 from ..constitutive import lame
 from ..gradients import Numbers, check_fixed, refuse_grad, vector
 from ..keys import check_needed, checked_list
-from ..node_conditions import NodeDamping
 from ..selections import in_box
 from .dialects import (
     PHYSGAUSSIAN,
@@ -100,7 +100,7 @@ class MPM_Simulator_WARP(Viewed):
         self._selections: dict[str, Tensor] = {}
         self._covariance: Tensor | None = None
         self._exports: dict[str, Any] = {}
-        self._damping: NodeDamping | None = None
+        self._damping: Damping | None = None
         self._clear_conditions()
         self._pending, self._versions = Pending(), {}
 
@@ -203,7 +203,7 @@ class MPM_Simulator_WARP(Viewed):
             self._state = self._loaded().replace(x=state.x + torch.as_tensor(shift).to(state.x))
         scale = self.parameters.get("grid_v_damping_scale", 1.0)
         damps = isinstance(scale, Tensor) or scale < 1
-        self._damping, self._law, self._step = NodeDamping(scale) if damps else None, None, None
+        self._damping, self._law, self._step = Damping(scale) if damps else None, None, None
 
     def _recognise(self, given: Mapping[str, Any], boxes: list[Any], of_configuration: Dialect | None) -> None:
         """Choose the dialect by the first keys that PhysGaussian does not have, and report it."""

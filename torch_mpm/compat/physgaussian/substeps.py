@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from ...boundaries import Damping
 from ...cuda_graphs.capture import version
 from ...errors import check_number
 from ...grid.grid import Grid
@@ -17,7 +18,6 @@ from ...state.state import State
 from ...step.particle_operations import Timed
 from ...step.step import Step
 from ..clipping import ClippedRollout
-from ..node_conditions import NodeDamping
 from .condition_list import Nodes, acts, changes
 from .descendants import DescendantMethods
 from .law_choice import chosen_law, kinds_of, law_indices, needs_moduli
@@ -48,7 +48,7 @@ class Substeps(DescendantMethods):
     _moduli: dict[str, Any] | None
     _law: Material | None
     _step: ClippedRollout | None
-    _damping: NodeDamping | None
+    _damping: Damping | None
     _affine: list[Timed]
     _enabled: tuple[int | None, list[Timed]]
     _selections: dict[str, Tensor]

@@ -9,13 +9,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ...boundaries import Damping
 from ...cuda_graphs.capture import version
 from ...errors import check_count, check_flag, check_number, shape_of
 from ...grid.grid import Grid
 from ...state.state import State
 from ..clipping import ClippedRollout
 from ..keys import check_keys
-from ..node_conditions import NodeDamping
 from ..physgaussian.condition_list import Nodes, acts, changes
 from ..physgaussian.dialects import BASE_KEYS, DIALECTS, code_of, material_of
 from ..physgaussian.law_choice import chosen_law
@@ -275,7 +275,7 @@ class MPMWARPDiff(ParticleConditions):
         """Conditions that are active at times from `first` to `last`, on nodes and on particles."""
         damping = model.grid_v_damping_scale
         nodes = [b for b in self._boundaries(grid) if acts(b, first, last, dt)]
-        nodes = [NodeDamping(damping), *nodes] if isinstance(damping, Tensor) or damping < 1 else nodes
+        nodes = [Damping(damping), *nodes] if isinstance(damping, Tensor) or damping < 1 else nodes
         return nodes, [o for o in (*self._pushes, *self._holds) if acts(o, first, last, dt)]
 
     def _nodes(self, model: MPMModelStruct, x: Tensor) -> Nodes:
