@@ -56,7 +56,7 @@ def plain(side: int, device: str, law: str = "fixed corotated", damping: float =
     points = mpm.seed.Points(x, torch.full((len(x),), volume, device=device))
     state = mpm.State.at_rest(points, DENSITY, dtype=torch.float32, device=device)
     made = {"fixed corotated": mpm.FixedCorotated, "neo-Hookean": mpm.NeoHookean}[law](E=E, nu=NU)
-    boundaries = [] if damping == 1 else [mpm.boundaries.Damping(damping)]
+    boundaries: list[Any] = [] if damping == 1 else [mpm.boundaries.Damping(damping)]
     step = mpm.Step(mpm.Grid(1 / n, (0.0,) * 3, (1.0,) * 3), made, GRAVITY, boundaries=boundaries, **options)
     return rolled(step, state)
 
@@ -121,7 +121,7 @@ def of_nclaw(side: int, device: str, eps: float = 0.0) -> Frame:
     statics.enabled = torch.ones(len(x), dtype=torch.int32, device=device)
     law = nclaw.material.CorotatedElasticity({"E": E, "nu": NU}).to(device).requires_grad_(False)
     solver = nclaw.sim.MPMDiffSim(model)
-    return stepwise(lambda *particles: solver(statics, *particles, law(particles[-1])), x)
+    return stepwise(lambda x, v, C, F: solver(statics, x, v, C, F, law(F)), x)
 
 
 def of_mpm_pytorch(side: int, device: str) -> Frame:
@@ -129,18 +129,19 @@ def of_mpm_pytorch(side: int, device: str) -> Frame:
     solver = mpm_pytorch.MPMSolver(x, num_grids=n, dt=DT, gravity=GRAVITY, rho=DENSITY, device=device)
     solver.vol, solver.p_mass = volume, DENSITY * volume
     law = mpm_pytorch.get_constitutive("CorotatedElasticity", device=device)
-    return stepwise(lambda *particles: solver(*particles, law(particles[-1])), x)
+    return stepwise(lambda x, v, C, F: solver(x, v, C, F, law(F)), x)
 
 
 def stepwise(one: Callable[..., tuple[Tensor, ...]], x: Tensor) -> Frame:
     """FRAME calls of a function of x, v, C and F."""
     zero = x.new_zeros(len(x), 3, 3)
-    state = [(x, 0 * x, zero, torch.eye(3, device=x.device).expand_as(zero).contiguous())]
+    particles: tuple[Tensor, ...] = (x, 0 * x, zero, torch.eye(3, device=x.device).expand_as(zero).contiguous())
 
     def frame() -> Tensor:
+        nonlocal particles
         for _ in range(FRAME):
-            state[0] = tuple(one(*state[0]))
-        return state[0][0]
+            particles = one(*particles)
+        return particles[0]
 
     return frame
 

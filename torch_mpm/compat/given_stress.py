@@ -134,6 +134,6 @@ class GivenStressSteps:
 
 def clamped(x: Tensor, lower: float | Tensor, upper: float | Tensor) -> Tensor:
     """Positions between two bounds, numbers or [P, 1]."""
-    if not (torch.is_grad_enabled() and x.requires_grad or isinstance(lower, Tensor) or isinstance(upper, Tensor)):
+    if not ((torch.is_grad_enabled() and x.requires_grad) or isinstance(lower, Tensor) or isinstance(upper, Tensor)):
         return x.clamp(lower, upper)
     return torch.minimum(torch.maximum(x, x.new_zeros(()) + lower), x.new_zeros(()) + upper)
