@@ -397,7 +397,7 @@ def raw_arguments(device: str) -> list:
     ball = [mpm.Sphere((0.5, 0.4), 0.1)]
     laws = ("von_mises,neo_hookean", [0, 0], [scalar, scalar, 0.01 * scalar, scalar, scalar, 0.5 * scalar], [1, 0])
     particles = (state.x, state.v, state.mass, state.volume, 0.1 * F.to(device), F.to(device), None, 1e-9 * state.x)
-    how = (3, DT, True, 0.9, True, 0, torch.randn(2, D, generator=g, dtype=F64).to(device))
+    how = (3, DT, True, [0.9, 1.0], True, 0, torch.randn(2, D, generator=g, dtype=F64).to(device))
     walls = wall_arguments(mpm.Walls("slip"), grid)
     obstacles = obstacle_arguments(ball, state.x, 2)
     impulse = torch.randn(2, 5, 3, generator=g, dtype=F64).to(device)

@@ -10,9 +10,31 @@ enum class ObstacleShape : int { plane, sphere, box, capsule, revolved, sampled,
 
 inline namespace TORCH_MPM_ISA {
 
-// Signed distance of a point (distance from the axis, position along it) from a closed polygon, and the outward normal
-// of its nearest edge; among equals, the first counts. `second` is the distance of the edge that is nearest but for
-// this one.
+// From the nearest point of the edge between two corners to a point (distance from the axis, position along it).
+template <class S>
+MPM_HD Vector<S, 2> offset_from_edge(const ValueOf<S>* a, const ValueOf<S>* b, const Vector<S, 2>& p) {
+  const Vector<S, 2> edge = {{lift<S>(b[0] - a[0]), lift<S>(b[1] - a[1])}};
+  const Vector<S, 2> arm = {{p[0] - lift<S>(a[0]), p[1] - lift<S>(a[1])}};
+  const S along = dot(arm, edge) / dot(edge, edge);
+  if (!(along < S(1))) return {{p[0] - lift<S>(b[0]), p[1] - lift<S>(b[1])}};  // exactly as from the next edge
+  return arm + (along > S(0) ? S(0) - along : S(0)) * edge;
+}
+
+// Whether a point inside a polygon is nearly as deep below an edge, or the corner at its end, as below its nearest
+// edge. A corner of at least 90 degrees is at most √2 times as far as it is deep.
+template <class T>
+MPM_HD bool is_nearly_as_deep(const T* a, const T* b, const Vector<T, 2>& p, const T& depth) {
+  const Vector<T, 2> offset = offset_from_edge(a, b, p), edge = {{b[0] - a[0], b[1] - a[1]}};
+  const T along = dot(offset, edge), squared = dot(offset, offset);
+  const bool at_corner = along * along > T(1e-6) * squared * dot(edge, edge);
+  const T far = (at_corner ? T(1.5) : T(1.001)) * depth;
+  return !(squared > far * far);
+}
+
+// Signed distance of a point from a closed polygon, and the outward normal of its nearest edge; among equals, the first
+// counts. `second` is the distance of the edge that is nearest but for this one; inside, where no edge or corner is
+// nearly as deep as the nearest one (grid/solid.h has the depth of corners), it is that on the way by the nearest point
+// of the polygon. So the other side of a thin wall is far.
 template <class S>
 MPM_HD S polygon_surface(const ValueOf<S>* corner, int corners, const Vector<S, 2>& p, Vector<S, 2>& normal,
                          ValueOf<S>& second) {
@@ -20,32 +42,43 @@ MPM_HD S polygon_surface(const ValueOf<S>* corner, int corners, const Vector<S, 
   S nearest = S(std::numeric_limits<T>::max());
   second = std::numeric_limits<T>::max();
   normal = zero_vector<S, 2>();
+  Vector<T, 2> foot = zero_vector<T, 2>();
+  int first = -1;
   bool inside = false;
+  const auto end_of = [&](int k) { return corner + 2 * (k + 1 < corners ? k + 1 : 0); };
   for (int k = 0; k < corners; k++) {
-    const T *const a = corner + 2 * k, *const b = corner + 2 * (k + 1 < corners ? k + 1 : 0);
+    const T *const a = corner + 2 * k, *const b = end_of(k);
     const Vector<S, 2> edge = {{lift<S>(b[0] - a[0]), lift<S>(b[1] - a[1])}};
-    const Vector<S, 2> arm = {{p[0] - lift<S>(a[0]), p[1] - lift<S>(a[1])}};
     // An odd number of edges is crossed by the ray from the point away from the axis.
-    const S side = edge[0] * arm[1] - edge[1] * arm[0];
+    const S side = edge[0] * (p[1] - lift<S>(a[1])) - edge[1] * (p[0] - lift<S>(a[0]));
     if ((a[1] > value_of(p[1])) != (b[1] > value_of(p[1])) && (edge[1] > S(0) ? side > S(0) : side < S(0)))
       inside = !inside;
     if (a[0] == T(0) && b[0] == T(0)) continue;  // an edge on the axis is inside the body
-    const S along = dot(arm, edge) / dot(edge, edge);
-    Vector<S, 2> offset;
-    if (!(along < S(1)))  // exactly as from the next edge
-      offset = {{p[0] - lift<S>(b[0]), p[1] - lift<S>(b[1])}};
-    else
-      offset = arm + (along > S(0) ? S(0) - along : S(0)) * edge;
+    const Vector<S, 2> offset = offset_from_edge(a, b, p);
     const S distance = length(offset);
     if (distance < nearest) {
       second = value_of(nearest);
       nearest = distance;
       normal = direction(Vector<S, 2>{{edge[1], S(0) - edge[0]}});
+      foot = {{value_of(p[0]) - value_of(offset[0]), value_of(p[1]) - value_of(offset[1])}};
+      first = k;
     } else if (value_of(distance) < second) {
       second = value_of(distance);
     }
   }
-  return inside ? S(0) - nearest : nearest;
+  if (!inside) return nearest;
+  const Vector<T, 2> point = {{value_of(p[0]), value_of(p[1])}};
+  const T depth = value_of(nearest);
+  T gap = std::numeric_limits<T>::max();
+  for (int k = 0; k < corners; k++) {
+    const T *const a = corner + 2 * k, *const b = end_of(k);
+    if (k == first || (a[0] == T(0) && b[0] == T(0))) continue;
+    if (is_nearly_as_deep(a, b, point, depth)) return S(0) - nearest;
+    const T distance = length(offset_from_edge(a, b, foot));
+    if (distance < gap) gap = distance;
+  }
+  second = depth + gap;
+  return S(0) - nearest;
 }
 
 // Height of a point (distance from the axis, position along it) above the line of edge k of a polygon; `beyond` is how

@@ -118,8 +118,8 @@ struct Substeps {
     backend::add_scaled(AddScaledArguments<T, D>{in.x.size(0), to, particles.velocity, constant(to), -1}, stream);
   }
 
-  // Computes the nodes, zero on entry, and their velocities before the forces and all boundaries except mirrors, without damping;
-  // returns the arguments of the update.
+  // Computes the nodes, zero on entry, and their velocities before the forces and all boundaries except mirrors,
+  // without damping; returns the arguments of the update.
   GridUpdateArguments<T, D> find_nodes_before(P2GArguments<T, D> particles, T* nodes, NodeRow<T, D>* updated,
                                               backend::Stream stream) const {
     particles.stress = {};
@@ -369,7 +369,8 @@ Substeps<T, D>::Substeps(const SubstepsInputs& inputs) : in(inputs) {
   if (has(in.impulse)) {
     check_shape(*in.impulse, "impulse", impulse_shape());
     check_type(*in.impulse, "impulse", ScalarType::Double, in.x);
-    STD_TORCH_CHECK(!flips() || !update.walls.mirrored, "impulses on mirrors are not counted with flip, got ", in.flip());
+    STD_TORCH_CHECK(!flips() || !update.walls.mirrored, "impulses on mirrors are not counted with flip, got ",
+                    in.flip());
     STD_TORCH_CHECK(in.damping() == 1, "impulses are not counted with damping, got ", in.damping());
   }
   facts = facts_of_call();
