@@ -197,13 +197,15 @@ class MPMSolver:
         """
         lists = (list(self.pre_particle_process), list(self.post_grid_process))
         on_dense_grid = shows or any(writes_grid(process) for process in lists[1])
-        if self._acting == lists and (self.step.on_grid is not None) == on_dense_grid:
+        damping = [Damping(self.damping)] if self.damping < 1 else []
+        damped = [b for b in self.step.boundaries if isinstance(b, Damping)]
+        same = self._acting == lists and [b.share for b in damped] == [b.share for b in damping]
+        if same and (self.step.on_grid is not None) == on_dense_grid:
             return
         self._changes += self._acting != lists
         self._acting = lists
         operations = [Written(self, o) if writes_particles(o) else o for o in lists[0]]
         self.step.on_particles = Operations(operations) if operations else None
-        damping = [Damping(self.damping)] if self.damping < 1 else []
         self.step.on_grid = self._on_dense_grid if on_dense_grid else None
         self.step.boundaries = damping if on_dense_grid else [*damping, *lists[1]]  # type: ignore[assignment]
 
