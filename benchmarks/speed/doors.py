@@ -4,9 +4,8 @@
     python -m benchmarks.speed.doors --device cuda         # 97 336 particles
     python -m benchmarks.speed.doors --quick               # seconds
 
-A falling jelly cube, fixed corotated but for taichi_elements, whose solid is neo-Hookean here, too. Each interface
-is called as its own programs do: frames of 100 substeps, or one call of the solver and of its law per substep. Without
-gradients.
+A fixed corotated cube that has just begun to fall. Each interface is called as its own programs do: frames of 100
+substeps, or one call of the solver and of its law per substep. Without gradients. `rollout` has no `eps` of NCLaw.
 """
 
 from __future__ import annotations
@@ -30,7 +29,9 @@ from .. import common, regressions
 FRAME = 100
 """Substeps between two reads of the positions."""
 SIDE = {"cpu": 22, "cuda": 46}
-E, NU, DENSITY, DT, GRAVITY = 1e5, 0.3, 1000.0, 1e-4, (0.0, -9.8, 0.0)
+E, NU, DENSITY, GRAVITY = 1e5, 0.3, 1000.0, (0.0, -1.0, 0.0)
+DT = 1e-5
+"""A time step [s] in which the cube falls by few cells in all frames."""
 LEAST_SECONDS, LEAST_ROUNDS = 0.5, 3
 
 Frame = Callable[[], object]
@@ -50,14 +51,14 @@ def rolled(step: mpm.Step, state: mpm.State) -> Frame:
     return lambda: mpm.rollout(step, state, FRAME, DT)
 
 
-def plain(side: int, device: str, law: str = "fixed corotated", damping: float = 1.0, **options: Any) -> Frame:
+def plain(side: int, device: str, damping: float = 1.0, **options: Any) -> Frame:
     """`torch_mpm.rollout`."""
     n, x, volume = cube(side, device)
     points = mpm.seed.Points(x, torch.full((len(x),), volume, device=device))
     state = mpm.State.at_rest(points, DENSITY, dtype=torch.float32, device=device)
-    made = {"fixed corotated": mpm.FixedCorotated, "neo-Hookean": mpm.NeoHookean}[law](E=E, nu=NU)
+    law = mpm.FixedCorotated(E=E, nu=NU)
     boundaries: list[Any] = [] if damping == 1 else [mpm.boundaries.Damping(damping)]
-    step = mpm.Step(mpm.Grid(1 / n, (0.0,) * 3, (1.0,) * 3), made, GRAVITY, boundaries=boundaries, **options)
+    step = mpm.Step(mpm.Grid(1 / n, (0.0,) * 3, (1.0,) * 3), law, GRAVITY, boundaries=boundaries, **options)
     return rolled(step, state)
 
 
@@ -100,7 +101,7 @@ def warp_mpm(side: int, device: str) -> Frame:
 def taichi(side: int, device: str) -> Frame:
     n, x, _ = cube(side, device)
     solver = taichi_elements.MPMSolver((n,) * 3, E_scale=0.1, device=device)
-    solver.set_gravity(GRAVITY)
+    solver.set_gravity((0.0,) * 3)  # its own time step is long
     solver.add_particles(x.cpu().numpy(), solver.material_elastic)
     length = (FRAME - 0.5) * solver.default_dt
 
@@ -154,13 +155,13 @@ PAIRS: dict[str, tuple[Make, Make]] = {
         lambda side, device: physgaussian(side, device, DAMPED),
         lambda side, device: plain(side, device, damping=DAMPED),
     ),
-    "PhysGaussian, impulse at the start": (lambda side, device: physgaussian(side, device, impulse=True), plain),
+    "PhysGaussian, after an impulse": (lambda side, device: physgaussian(side, device, impulse=True), plain),
     "MPMWARPDiff": (warp_mpm, plain),
     "taichi_elements": (taichi, lambda side, device: plain(side, device, stress_form="mls")),
-    "NCLaw": (of_nclaw, lambda side, device: plain(side, device, stress_form="mls")),
+    "NCLaw": (of_nclaw, lambda side, device: plain(side, device, stress_form="mls", walls="separate")),
     "NCLaw, eps 1e-7": (
         lambda side, device: of_nclaw(side, device, 1e-7),
-        lambda side, device: plain(side, device, stress_form="mls"),
+        lambda side, device: plain(side, device, stress_form="mls", walls="separate"),
     ),
     "MPM-PyTorch": (of_mpm_pytorch, plain),
 }

@@ -81,6 +81,15 @@ def test_impulses_on_damping_need_single_steps():
     """The momentum that damping takes is counted: m v0 (1 - s^n), on the entry of the list."""
     step, state = free("cpu", [Damping(0.9), ball(start=1.0)])
     state = step.with_impulses(step.prepare(state))
+    whole = mpm.Step(step.grid, step.law, boundaries=[Damping(1.0)])
+    assert (
+        float(
+            whole.impulses(mpm.rollout(whole, whole.with_impulses(state.replace(impulse=None)), 3, DT))
+            .values.abs()
+            .max()
+        )
+        == 0
+    )
     assert "impulses" in mpm.plan_rollout(step, state, N, DT).reasons["fused"]
     end = mpm.rollout(step, state, N, DT)
     taken = step.impulses(end).values[0, 0, :2]
@@ -112,6 +121,18 @@ def test_the_gradient_by_a_tensor():
 def test_other_shares_are_errors(share, error, words):
     with pytest.raises(error, match=words):
         Damping(share)
+    damping = Damping(0.5)
+    with pytest.raises(error, match=words):
+        damping.share = share
+    assert damping.share == 0.5
+
+
+def test_a_share_that_is_assigned_acts():
+    step, state = free("cpu", [Damping(0.5)])
+    step.boundaries[0].share = 1
+    torch.testing.assert_close(mpm.rollout(step, state, 3, DT).v, state.v)
+    step.boundaries[0].share = torch.tensor(-1.0, dtype=F64)
+    assert float(mpm.rollout(step, state, 3, DT).v.abs().max()) == 0
 
 
 @pytest.mark.parametrize(

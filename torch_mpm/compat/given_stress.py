@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..cuda_graphs.capture import Same, is_eager, version
+from ..cuda_graphs.capture import NUMBERS, Same, is_eager, version
 from ..cuda_graphs.graph import Replays, WorkInFlight, copy_all
 from ..cuda_graphs.keys import StepKey, surroundings
 from ..errors import check_like
@@ -22,13 +22,19 @@ from ..step.step import Step
 Particles = tuple[Tensor, Tensor, Tensor, Tensor]
 """x, v, C and F."""
 STRESS = "stress"
+"""Field of the states of a graph."""
 
 
 class GivenStress(Material):
-    """Law that returns the stress in `extra` of the state."""
+    """Law that returns the stress that was set last."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.given: Tensor | None = None
 
     def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
-        return {}, state.extra[STRESS]
+        assert self.given is not None
+        return {}, self.given
 
     def invalid(self, state: State) -> Tensor:
         assert state.F is not None
@@ -38,8 +44,8 @@ class GivenStress(Material):
 class GivenStressSteps:
     """Steps of a `GivenStress`, one by one.
 
-    On CUDA and without gradients the second and later calls of one kind replay a CUDA graph: a launch of it takes the
-    host as long as that of a few kernels.
+    On CUDA and without gradients the second and later calls of one kind replay a CUDA graph, which the host launches in
+    the time of a few kernels.
 
     Args:
         step: the step; it may be changed between two calls.
@@ -47,9 +53,22 @@ class GivenStressSteps:
 
     def __init__(self, step: Step) -> None:
         self.step = step
+        self._forget()
+
+    def _forget(self) -> None:
         self._kind: Hashable = None
         self._replays: Replays | None = None
-        self._unseen = 0  # Replays since the latest block count.
+        self._in_flight: WorkInFlight | None = None
+        self._status: Tensor | None = None  # of the graph
+        self._unseen = 0  # replays since the latest block count
+
+    def __getstate__(self) -> dict[str, Any]:
+        """State for copies, without the graph."""
+        return {"step": self.step}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.step = state["step"]
+        self._forget()
 
     def __call__(
         self,
@@ -71,7 +90,8 @@ class GivenStressSteps:
             time: [s].
             dt: [s].
             end: particles of the state after the step; called in the capture of a graph.
-            read: numbers and tensors that mass, volume and `end` depend on; None for steps that are not captured.
+            read: numbers and tensors that mass, volume, `end` and functions of the step depend on; None for steps that
+                depend on others, such as the time.
 
         Raises:
             TypeError, ValueError: for wrong shapes, dtypes or devices.
@@ -79,57 +99,93 @@ class GivenStressSteps:
         x, v, C, F = given
         stress = from_half(stress, x)
         check_like("stress", stress, x, (len(x), 3, 3), "[P, 3, 3]")
-        extra = {STRESS: stress}
-        state = State(x=x, v=v, mass=mass.to(x), volume=volume.to(x), C=C, F=F, time=time, extra=extra)
+        state = State(x=x, v=v, mass=mass.to(x), volume=volume.to(x), C=C, F=F, time=time)
+        kind = None if read is None else self._kind_of(state, stress, dt, list(read))
+        if kind is not None and self._may_replay(state, kind):
+            return self._replayed(state, stress, dt, end)
+        return self._stepped(state, stress, dt, end)
 
-        def advanced(state: State) -> State:
-            x, v, C, F = end(self.step(state, dt))
-            return state.replace(x=x, v=v, C=C, F=F)
+    def _stepped(self, state: State, stress: Tensor, dt: float, end: Callable[[State], Particles]) -> Particles:
+        law = self.step.law
+        assert isinstance(law, GivenStress)
+        law.given = stress
+        try:
+            return end(self.step(state, dt))
+        finally:
+            law.given = None
 
-        kind = None if read is None else self._kind_of(state, dt, read)
-        after = advanced(state) if kind is None else self._replayed(advanced, state, kind)
-        assert after.C is not None and after.F is not None
-        return after.x, after.v, after.C, after.F
-
-    def _kind_of(self, state: State, dt: float, read: Iterable[Any]) -> Hashable:
+    def _kind_of(self, state: State, stress: Tensor, dt: float, read: list[Any]) -> Hashable:
         """Key of calls with one graph; None for those without one."""
         x, step = state.x, self.step
-        if not x.is_cuda or not is_eager(x) or detecting() or any(has_hooks(module) for module in step.modules()):
+        if not x.is_cuda or not is_eager(x) or detecting() or type(step) is not Step:
             return None
-        tensors = [*tensors_of(state).values(), *(value for value in read if isinstance(value, Tensor))]
-        if torch.is_grad_enabled() and any(t.requires_grad for t in (*tensors, *step.parameters(), *step.buffers())):
+        if step.integrator is not None or step.heat is not None or any(has_hooks(m) for m in step.modules()):
             return None
-        contents = [(Same(value), version(value)) if isinstance(value, Tensor) else value for value in read]
-        if any(t.is_inference() or t.device != x.device for t in tensors):
+        tensors = [value for value in read if isinstance(value, Tensor)]
+        fixed = [*tensors, *step.parameters(), *step.buffers()]
+        if torch.is_grad_enabled() and any(t.requires_grad for t in (*tensors_of(state).values(), stress, *fixed)):
             return None
-        return dt, len(x), x.dtype, x.device, tuple(contents), StepKey(step).key, surroundings(x.device)
+        if any(t.is_inference() or t.device != x.device for t in fixed):
+            return None
+        if not all(isinstance(value, (Tensor, *NUMBERS)) for value in read):
+            return None
+        contents = tuple((Same(value), version(value)) if isinstance(value, Tensor) else value for value in read)
+        known = StepKey(step)
+        with_gradients = tuple((name, Same(t)) for name, t in known.own.items())
+        place = x.device, torch.cuda.current_stream(x.device).cuda_stream, surroundings(x.device)
+        return dt, len(x), x.dtype, place, contents, known.key, with_gradients
 
-    def _replayed(self, advanced: Callable[[State], State], state: State, kind: Hashable) -> State:
-        """The state after a replay, or after a step that is to be captured if the next call is of the same kind."""
+    def _may_replay(self, state: State, kind: Hashable) -> bool:
+        """Whether the previous call was of this kind too, and its pool is large enough."""
         step = self.step
         if step.grid.grows and self._unseen > 1:
             step.grid.wait()
         kind = kind, step.grid.pool(state.x, None)
-        if kind != self._kind:
-            self._kind, self._replays = kind, None
-            return advanced(state)
+        if kind == self._kind and step.status is not None:
+            return True
+        self._forget()
+        self._kind = kind
+        return False
+
+    def _replayed(self, state: State, stress: Tensor, dt: float, end: Callable[[State], Particles]) -> Particles:
         if self._replays is None:
-            self._replays = Replays(advanced, state, step.grid.pool(state.x, None))
-            self._in_flight = WorkInFlight(state.x)
+            self._capture(state.replace(extra={STRESS: stress}), dt, end)
+        assert self._replays is not None and self._in_flight is not None
+        self._continue_status()
         graph = self._replays.state
-        assert graph.C is not None and graph.F is not None
-        given = state.x, state.v, state.C, state.F, state.extra[STRESS]
-        copy_all([graph.x, graph.v, graph.C, graph.F, graph.extra[STRESS]], [t for t in given if t is not None])
+        to, of = (graph.x, graph.v, graph.C, graph.F, graph.extra[STRESS]), (state.x, state.v, state.C, state.F, stress)
+        pairs = [(a, b) for a, b in zip(to, of, strict=True) if a is not None and b is not None]
+        copy_all([a for a, _ in pairs], [b for _, b in pairs])
         self._replays.replay(1, self._in_flight)
         self._watch()
-        return graph.replace(x=graph.x.clone(), v=graph.v.clone(), C=graph.C.clone(), F=graph.F.clone())
+        x, v, C, F = (a.clone() for a, _ in pairs[:4])
+        return x, v, C, F
+
+    def _capture(self, state: State, dt: float, end: Callable[[State], Particles]) -> None:
+        def advanced(state: State) -> State:
+            x, v, C, F = self._stepped(state.replace(extra={}), state.extra[STRESS], dt, end)
+            return state.replace(x=x, v=v, C=C, F=F)
+
+        errors = self.step._error_status
+        with torch.inference_mode(False), torch.no_grad(), errors.passing_graphs():
+            self._replays = Replays(advanced, state, self.step.grid.pool(state.x, None))
+        self._in_flight, self._status = WorkInFlight(state.x), errors.status
+
+    def _continue_status(self) -> None:
+        """Let the graph continue the status of steps that were computed without it."""
+        errors = self.step._error_status
+        if errors.status is self._status:
+            return
+        assert errors.status is not None and self._status is not None
+        with torch.inference_mode():  # Any tensor may be written to there.
+            self._status.copy_(errors.status)
+        errors.status = self._status
 
     def _watch(self) -> None:
         """Request the number of blocks of the latest step, unless a request is pending."""
-        grid, status = self.step.grid, self.step.status
-        assert status is not None
-        self._unseen = self._unseen + 1 if grid.watches else 0
-        grid.watch(status)
+        assert self._status is not None
+        self._unseen = self._unseen + 1 if self.step.grid.watches else 0
+        self.step.grid.watch(self._status)
 
 
 def clamped(x: Tensor, lower: float | Tensor, upper: float | Tensor) -> Tensor:

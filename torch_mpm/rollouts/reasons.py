@@ -71,8 +71,8 @@ def why_not_fused(step: Any, state: State, n: int, dt: float | Tensor) -> str | 
         return reason
     if any([has_hooks(module) for module in (step, *modules_in(law))]):
         return "there are hooks"
-    damping, obstacles = split_damping(boundaries.entries)
-    if damping != 1 and state.impulse is not None:
+    _, obstacles = split_damping(boundaries.entries)
+    if len(obstacles) < len(boundaries.entries) and state.impulse is not None:
         return "impulses on boundaries are counted, of which damping is one"
     others = [b for b in obstacles if not (isinstance(b, Obstacle) and fusible(b, 0.0, paths=True))]
     if others:

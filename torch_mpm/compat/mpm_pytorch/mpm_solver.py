@@ -98,7 +98,7 @@ class MPMSolver:
         self.step = Step(Grid(self.dx, (0.0,) * 3, (1.0,) * 3), GivenStress(), stress_form="gradient")
         self._steps = GivenStressSteps(self.step)
         self.gravity = gravity
-        self._acting: tuple[list[Any], list[Any]] | None = None
+        self._acting: tuple[tuple[list[Any], list[Any]], float] | None = None  # Conditions and damping of the step.
         self._changes = 0  # Lengths of the lists of conditions.
         self._last: tuple[Any, ...] | None = None  # Arguments of the last call.
         self._nodes: tuple[Tensor, Tensor] | None = None  # Of the last call, where they are known.
@@ -149,11 +149,17 @@ class MPMSolver:
         volume, mass = (self._of_particles(name, getattr(self, name), x) for name in ("vol", "p_mass"))
         result = self._steps(
             *((x, v, C, F), stress, mass, volume, time, self.dt, self._ended),
-            None if any(self._acting or ()) or self._shows else (self.clip_bound, self.vol, self.p_mass),
+            (self.clip_bound, self.vol, self.p_mass) if self._is_plain() else None,
         )
         if recomputed:
             self._times.store(result, (time + self.dt, self._changes))
         return result
+
+    def _is_plain(self) -> bool:
+        """Whether nothing but damping acts on nodes and particles."""
+        step = self.step
+        others = [b for b in step.boundaries.entries if type(b) is not Damping]
+        return not (others or step.on_particles is not None or step.on_grid is not None or self._shows)
 
     def _ended(self, state: State) -> Particles:
         """Particles after a step, clamped. Weights are those of the positions before they are displaced, as in
@@ -197,15 +203,14 @@ class MPMSolver:
         """
         lists = (list(self.pre_particle_process), list(self.post_grid_process))
         on_dense_grid = shows or any(writes_grid(process) for process in lists[1])
-        damping = [Damping(self.damping)] if self.damping < 1 else []
-        damped = [b for b in self.step.boundaries if isinstance(b, Damping)]
-        same = self._acting == lists and [b.share for b in damped] == [b.share for b in damping]
-        if same and (self.step.on_grid is not None) == on_dense_grid:
+        acting = lists, self.damping
+        if self._acting == acting and (self.step.on_grid is not None) == on_dense_grid:
             return
-        self._changes += self._acting != lists
-        self._acting = lists
+        self._changes += self._acting is None or self._acting[0] != lists
+        self._acting = acting
         operations = [Written(self, o) if writes_particles(o) else o for o in lists[0]]
         self.step.on_particles = Operations(operations) if operations else None
+        damping = [Damping(self.damping)] if self.damping < 1 else []
         self.step.on_grid = self._on_dense_grid if on_dense_grid else None
         self.step.boundaries = damping if on_dense_grid else [*damping, *lists[1]]  # type: ignore[assignment]
 

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ...cuda_graphs.capture import Same, version
 from ...data.whole_files import is_name
 from ..gradients import refuse_grad
 from ..settings import setting
@@ -42,6 +43,7 @@ class MPMStatics:
     def __init__(self, shape: int, device: torch.device | str | None = None) -> None:
         self.vol, self.rho, self.clip_bound = (torch.zeros(shape, device=device) for _ in range(3))
         self.enabled = torch.zeros(shape, dtype=torch.int32, device=device)
+        self._enabled_by: tuple[Any, ...] | None = None  # Sections and values of `enabled`.
 
     def update_vol(self, sections: Sequence[int], vols: Sequence[float]) -> None:
         """Set the volume of each section."""
@@ -57,7 +59,10 @@ class MPMStatics:
 
     def update_enabled(self, sections: Sequence[int], spans: Sequence[tuple[int, int]], step: int = 0) -> None:
         """Enable each section while first ≤ step < last of its span."""
-        self.enabled = _by_section(self.enabled, sections, [int(a <= step < b) for a, b in spans])
+        values = [int(a <= step < b) for a, b in spans]
+        if self._enabled_by != (list(sections), values, Same(self.enabled), version(self.enabled)):
+            self.enabled = _by_section(self.enabled, sections, values)
+            self._enabled_by = list(sections), values, Same(self.enabled), version(self.enabled)
 
 
 def _by_section(like: Tensor, sections: Sequence[int], values: Sequence[float | Tensor]) -> Tensor:

@@ -81,8 +81,14 @@ class MPMModel:
             raise TypeError(f"statics must be an MPMStatics, got {shape_of(statics)}")
         volume = statics.vol.to(x)
         mass, read = statics.rho.to(x) * volume, (statics.vol, statics.rho, statics.enabled, statics.clip_bound)
-        self._statics = statics
-        return self._steps((x, v, C, F), stress, mass, volume, 0.0, self.dt, self._ended, read)
+        self._statics, plain = statics, self._is_plain()
+        return self._steps((x, v, C, F), stress, mass, volume, 0.0, self.dt, self._ended, read if plain else None)
+
+    def _is_plain(self) -> bool:
+        """Whether nothing acts that the model has not set."""
+        step = self.step
+        own = step.on_particles == self._present and (step.on_grid is None or type(step.on_grid) is HeavyNodes)
+        return own and not step.boundaries.entries
 
     def _ended(self, state: State) -> Particles:
         """Particles after a step, with positions clamped except those of particles that are not enabled."""
@@ -189,7 +195,7 @@ class MPMDiffSim(MPMSim):
 
 
 class MPMCacheDiffSim(MPMSim):
-    """`x, v, C, F = sim(statics, step, x, v, C, F, stress)`; nothing is stored between calls, for any num_steps.
+    """`x, v, C, F = sim(statics, step, x, v, C, F, stress)`; no call depends on an earlier one, for any num_steps.
 
     Args:
         model: see `MPMModelBuilder`.
