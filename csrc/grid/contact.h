@@ -63,7 +63,9 @@ struct NodeTouch {
 template <class T, int D>
 class NearestSurface {
  public:
-  MPM_HD NearestSurface(const ContactArguments<T, D>& a, const Vector<T, D>& position) : a_(a), position_(position) {}
+  // `at_wall`: whether the position is on a wall, from where surfaces beside it are seen, too.
+  MPM_HD NearestSurface(const ContactArguments<T, D>& a, const Vector<T, D>& position, bool at_wall = false)
+      : a_(a), position_(position), farthest_(a.rounding + (at_wall ? beside_wall(a) : T(0))) {}
 
   MPM_HD void operator()(int k, const ObstaclePose<T, D>& pose) {
     Vector<T, D> normal;
@@ -76,7 +78,7 @@ class NearestSurface {
     }
     second_ = nearest_ < other ? nearest_ : other;
     nearest_ = distance;
-    if (!(distance <= a_.rounding)) return;
+    if (!(distance <= farthest_)) return;
     if (pose.shape == ObstacleShape::box) {
       const int face = nearest_face(a_, pose, body);
       MPM_UNROLL for (int i = 0; i < D; i++)
@@ -95,13 +97,16 @@ class NearestSurface {
     return touch_;
   }
 
-  // Of a node at a wall or beyond, seen from the point of the wall; `sign` as `within_walls` gives it. Samples of
-  // distances have slopes up to √D.
+  // Of a node at a wall or beyond, seen from the point of the wall; `sign` as `within_walls` gives it. A surface that
+  // is perpendicular to the wall leaves no gap beside it; points beside the wall may be nearer to it by its curvature.
   MPM_HD NodeTouch<T, D> at_wall(const Vector<T, D>& sign) {
-    if (is_inside() && second_ > away() && is_along_walls(&sign)) return touch_;
     NodeTouch<T, D> touch;
-    const T way = T(1.001 * D) * SolidAt<T, D>::seam_of(a_);
-    if (nearest_ <= a_.rounding + way) touch.obstacle = NodeTouch<T, D>::several;
+    if (nearest_ > farthest_) return touch;
+    const bool outside = nearest_ > T(0.01 * a_.dx);
+    if ((is_inside() && second_ > away()) || (outside && second_ > farthest_)) {
+      if (is_along_walls(&sign)) return outside ? touch : touch_;
+    }
+    touch.obstacle = NodeTouch<T, D>::several;
     return touch;
   }
 
@@ -109,6 +114,10 @@ class NearestSurface {
   MPM_HD static T near_wall(const ContactArguments<T, D>& a) { return a.rounding + T(1e-6 * a.dx); }
 
  private:
+  // How far the point beside a wall is, from which `find_surfaces` looks into gaps. Samples of distances have slopes up
+  // to √D.
+  MPM_HD static T beside_wall(const ContactArguments<T, D>& a) { return T(1.001 * D) * SolidAt<T, D>::seam_of(a); }
+
   // Faces and walls within this distance may join the nearest surface.
   MPM_HD T away() const { return 2 * SolidAt<T, D>::seam_of(a_) - nearest_; }
 
@@ -116,12 +125,12 @@ class NearestSurface {
   // that the node is behind. Contact with the surface alone then keeps the velocity that the walls gave the node.
   MPM_HD bool is_along_walls(const Vector<T, D>* sign = nullptr) {
     constexpr double parallel = 1e-6;  // sine of the angle
-    const T fastest = T(parallel) * length(touch_.velocity);
+    const T fastest = T(parallel) * length(touch_.velocity), near = near_wall(a_) > away() ? near_wall(a_) : away();
     bool along = true;
     MPM_UNROLL for (int face = 0; face < 2 * D; face++) {
       const int axis = face / 2;
       const bool mirrored = sign && (*sign)[axis] < T(0);
-      if (a_.wall_kind[face] == Contact::open || !(mirrored || wall_height(a_, face, position_) <= away())) continue;
+      if (a_.wall_kind[face] == Contact::open || !(mirrored || wall_height(a_, face, position_) <= near)) continue;
       along = along && abs(touch_.normal[axis]) <= T(parallel) && abs(touch_.velocity[axis]) <= fastest;
       touch_.normal[axis] = touch_.velocity[axis] = T(0);
     }
@@ -130,6 +139,7 @@ class NearestSurface {
 
   const ContactArguments<T, D>& a_;
   const Vector<T, D> position_;
+  const T farthest_;  // distance of the surfaces that count
   T nearest_ = std::numeric_limits<T>::max(), second_ = std::numeric_limits<T>::max();
   NodeTouch<T, D> touch_;
 };
@@ -205,7 +215,7 @@ MPM_HD NodeTouch<T, D> touch_of_node(const SlotPoses<T, D>& poses, const Vector<
   Vector<T, D> sign = zero_vector<T, D>();
   const bool at_wall =
       !Exact && poses.s.walled && nearest_wall(poses.a, position) <= NearestSurface<T, D>::near_wall(poses.a);
-  NearestSurface<T, D> nearest(poses.a, at_wall ? within_walls(poses.a, position, T(0), sign) : position);
+  NearestSurface<T, D> nearest(poses.a, at_wall ? within_walls(poses.a, position, T(0), sign) : position, at_wall);
   const auto visit = [&](uint64_t obstacles) {
     for (uint64_t left = obstacles; left; left &= left - 1) nearest(lowest_bit(left), poses[lowest_bit(left)]);
   };
@@ -426,7 +436,7 @@ MPM_HD NodeTouch<T, D> lone_touch(const ContactArguments<T, D>& a, int scene, co
   Vector<T, D> position = node_position(a, corner, local), sign = zero_vector<T, D>();
   const bool at_wall = nearest_wall(a, position) <= NearestSurface<T, D>::near_wall(a);
   if (at_wall) position = within_walls(a, position, T(0), sign);
-  NearestSurface<T, D> nearest(a, position);
+  NearestSurface<T, D> nearest(a, position, at_wall);
   const ObstacleRow<T, D>* const row = rows_of_scene(a, scene);
   MPM_LOOP for (int k = 0; k < a.obstacles; k++) {
     const ObstaclePose<T, D> pose = obstacle_pose(a, a.kind[k], row[k], scene);

@@ -21,19 +21,19 @@ MPM_HD Vector<S, 2> offset_from_edge(const ValueOf<S>* a, const ValueOf<S>* b, c
 }
 
 // Whether a point inside a polygon is nearly as deep below an edge, or the corner at its end, as below its nearest
-// edge. A corner of at least 90 degrees is at most √2 times as far as it is deep.
+// edge. A corner of an angle α is at most 1/sin(α/2) times as far as it is deep, twice for 60 degrees.
 template <class T>
 MPM_HD bool is_nearly_as_deep(const T* a, const T* b, const Vector<T, 2>& p, const T& depth) {
   const Vector<T, 2> offset = offset_from_edge(a, b, p), edge = {{b[0] - a[0], b[1] - a[1]}};
   const T along = dot(offset, edge), squared = dot(offset, offset);
   const bool at_corner = along * along > T(1e-6) * squared * dot(edge, edge);
-  const T far = (at_corner ? T(1.5) : T(1.001)) * depth;
+  const T far = (at_corner ? T(2) : T(1.001)) * depth;
   return !(squared > far * far);
 }
 
 // Signed distance of a point from a closed polygon, and the outward normal of its nearest edge; among equals, the first
-// counts. `second` is the distance of the edge that is nearest but for this one; inside, where no edge or corner is
-// nearly as deep as the nearest one (grid/solid.h has the depth of corners), it is that on the way by the nearest point
+// counts. `second` is the distance of the edge that is nearest but for this one. Inside it is the depth where another
+// edge or corner is nearly as deep (grid/solid.h has the depth of corners), and otherwise the way by the nearest point
 // of the polygon. So the other side of a thin wall is far.
 template <class S>
 MPM_HD S polygon_surface(const ValueOf<S>* corner, int corners, const Vector<S, 2>& p, Vector<S, 2>& normal,
@@ -73,7 +73,10 @@ MPM_HD S polygon_surface(const ValueOf<S>* corner, int corners, const Vector<S, 
   for (int k = 0; k < corners; k++) {
     const T *const a = corner + 2 * k, *const b = end_of(k);
     if (k == first || (a[0] == T(0) && b[0] == T(0))) continue;
-    if (is_nearly_as_deep(a, b, point, depth)) return S(0) - nearest;
+    if (is_nearly_as_deep(a, b, point, depth)) {
+      second = depth;
+      return S(0) - nearest;
+    }
     const T distance = length(offset_from_edge(a, b, foot));
     if (distance < gap) gap = distance;
   }
