@@ -8,21 +8,22 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..cuda_graphs.capture import NUMBERS, Same, is_eager, version
-from ..cuda_graphs.graph import Replays, WorkInFlight, copy_all
+from ..cuda_graphs.capture import NUMBERS, Same, is_eager
+from ..cuda_graphs.graph import WorkInFlight, copied, copy_all
 from ..cuda_graphs.keys import StepKey, surroundings
+from ..cuda_graphs.memory import GraphMemory
 from ..errors import check_like
 from ..laws import Material
 from ..laws.parameters import has_hooks
 from ..ops.precision import from_half
 from ..rollouts.anomaly import detecting
-from ..state.state import State, tensors_of
+from ..state.state import State
 from ..step.step import Step
 
 Particles = tuple[Tensor, Tensor, Tensor, Tensor]
 """x, v, C and F."""
-STRESS = "stress"
-"""Field of the states of a graph."""
+WATCHED = 16
+"""Replays between two requests of the number of active blocks."""
 
 
 class GivenStress(Material):
@@ -57,10 +58,9 @@ class GivenStressSteps:
 
     def _forget(self) -> None:
         self._kind: Hashable = None
-        self._replays: Replays | None = None
-        self._in_flight: WorkInFlight | None = None
+        self._graph: _Graph | None = None
         self._status: Tensor | None = None  # of the graph
-        self._unseen = 0  # replays since the latest block count
+        self._unwatched = 0  # replays since the latest request of the number of blocks
 
     def __getstate__(self) -> dict[str, Any]:
         """State for copies, without the graph."""
@@ -74,8 +74,7 @@ class GivenStressSteps:
         self,
         given: Particles,
         stress: Tensor,
-        mass: Tensor,
-        volume: Tensor,
+        constants: Callable[[Tensor], tuple[Tensor, Tensor]],
         time: float,
         dt: float,
         end: Callable[[State], Particles],
@@ -86,26 +85,28 @@ class GivenStressSteps:
         Args:
             given: particles before it.
             stress: Kirchhoff stress [P, 3, 3] [Pa].
-            mass, volume: [P] [kg, m³].
+            constants: mass and volume [P] [kg, m³] of particles at positions.
             time: [s].
             dt: [s].
-            end: particles of the state after the step; called in the capture of a graph.
-            read: numbers and tensors that mass, volume, `end` and functions of the step depend on; None for steps that
+            end: particles of the state after the step. A capture of a graph calls it, and `constants`.
+            read: numbers and tensors that `constants`, `end` and functions of the step depend on; None for steps that
                 depend on others, such as the time.
 
         Raises:
             TypeError, ValueError: for wrong shapes, dtypes or devices.
         """
-        x, v, C, F = given
-        stress = from_half(stress, x)
-        check_like("stress", stress, x, (len(x), 3, 3), "[P, 3, 3]")
-        state = State(x=x, v=v, mass=mass.to(x), volume=volume.to(x), C=C, F=F, time=time)
-        kind = None if read is None else self._kind_of(state, stress, dt, list(read))
-        if kind is not None and self._may_replay(state, kind):
-            return self._replayed(state, stress, dt, end)
-        return self._stepped(state, stress, dt, end)
+
+        def stepped(x: Tensor, v: Tensor, C: Tensor, F: Tensor, stress: Tensor) -> Particles:
+            mass, volume = constants(x)
+            return self._stepped(State(x=x, v=v, mass=mass, volume=volume, C=C, F=F, time=time), stress, dt, end)
+
+        stress = from_half(stress, given[0])
+        tensors = (*given, stress)
+        kind = None if read is None else self._kind_of(tensors, dt, list(read))
+        return stepped(*tensors) if kind is None else self._replayed(stepped, tensors, kind)
 
     def _stepped(self, state: State, stress: Tensor, dt: float, end: Callable[[State], Particles]) -> Particles:
+        check_like("stress", stress, state.x, (len(state), 3, 3), "[P, 3, 3]")
         law = self.step.law
         assert isinstance(law, GivenStress)
         law.given = stress
@@ -114,62 +115,40 @@ class GivenStressSteps:
         finally:
             law.given = None
 
-    def _kind_of(self, state: State, stress: Tensor, dt: float, read: list[Any]) -> Hashable:
+    def _kind_of(self, given: tuple[Tensor, ...], dt: float, read: list[Any]) -> Hashable:
         """Key of calls with one graph; None for those without one."""
-        x, step = state.x, self.step
-        if not x.is_cuda or not is_eager(x) or detecting() or type(step) is not Step:
+        x, step = given[0], self.step
+        if not isinstance(x, Tensor) or not x.is_cuda or not is_eager(x) or detecting() or type(step) is not Step:
             return None
-        if step.integrator is not None or step.heat is not None or any(has_hooks(m) for m in step.modules()):
+        if step.integrator is not None or step.heat is not None or any([has_hooks(m) for m in step.modules()]):
             return None
-        tensors = [value for value in read if isinstance(value, Tensor)]
-        fixed = [*tensors, *step.parameters(), *step.buffers()]
-        if torch.is_grad_enabled() and any(t.requires_grad for t in (*tensors_of(state).values(), stress, *fixed)):
+        fixed = [*(value for value in read if isinstance(value, Tensor)), *step.parameters(), *step.buffers()]
+        if torch.is_grad_enabled() and any([t.requires_grad for t in (*given, *fixed)]):
             return None
-        if any(t.is_inference() or t.device != x.device for t in fixed):
+        if any([t.device != x.device for t in fixed]) or not all([isinstance(r, (Tensor, *NUMBERS)) for r in read]):
             return None
-        if not all(isinstance(value, (Tensor, *NUMBERS)) for value in read):
-            return None
-        contents = tuple((Same(value), version(value)) if isinstance(value, Tensor) else value for value in read)
+        fields = tuple([(t.shape, t.dtype, t.device) for t in given])
+        contents = tuple([Same(value) if isinstance(value, Tensor) else value for value in read])
         known = StepKey(step)
-        with_gradients = tuple((name, Same(t)) for name, t in known.own.items())
-        place = x.device, torch.cuda.current_stream(x.device).cuda_stream, surroundings(x.device)
-        return dt, len(x), x.dtype, place, contents, known.key, with_gradients
+        with_gradients = tuple([(name, Same(t)) for name, t in known.own.items()])
+        stream = torch.cuda.current_stream(x.device).cuda_stream
+        return dt, fields, stream, surroundings(x.device), contents, known.key, with_gradients
 
-    def _may_replay(self, state: State, kind: Hashable) -> bool:
-        """Whether the previous call was of this kind too, and its pool is large enough."""
-        step = self.step
-        if step.grid.grows and self._unseen > 1:
-            step.grid.wait()
-        kind = kind, step.grid.pool(state.x, None)
-        if kind == self._kind and step.status is not None:
-            return True
-        self._forget()
-        self._kind = kind
-        return False
-
-    def _replayed(self, state: State, stress: Tensor, dt: float, end: Callable[[State], Particles]) -> Particles:
-        if self._replays is None:
-            self._capture(state.replace(extra={STRESS: stress}), dt, end)
-        assert self._replays is not None and self._in_flight is not None
+    def _replayed(self, stepped: Callable[..., Particles], given: tuple[Tensor, ...], kind: Hashable) -> Particles:
+        """Particles after a replay, or after a step that is captured if the next call is of the same kind."""
+        step, x = self.step, given[0]
+        blocks = step.grid.pool(x, None)
+        if (kind, blocks) != self._kind or step.status is None:
+            self._forget()
+            self._kind = kind, blocks
+            return stepped(*given)
+        if self._graph is None:
+            with torch.inference_mode(False), torch.no_grad(), step._error_status.passing_graphs():
+                self._graph, self._status = _Graph(stepped, given), step._error_status.status
         self._continue_status()
-        graph = self._replays.state
-        to, of = (graph.x, graph.v, graph.C, graph.F, graph.extra[STRESS]), (state.x, state.v, state.C, state.F, stress)
-        pairs = [(a, b) for a, b in zip(to, of, strict=True) if a is not None and b is not None]
-        copy_all([a for a, _ in pairs], [b for _, b in pairs])
-        self._replays.replay(1, self._in_flight)
+        after = self._graph.replay(given)
         self._watch()
-        x, v, C, F = (a.clone() for a, _ in pairs[:4])
-        return x, v, C, F
-
-    def _capture(self, state: State, dt: float, end: Callable[[State], Particles]) -> None:
-        def advanced(state: State) -> State:
-            x, v, C, F = self._stepped(state.replace(extra={}), state.extra[STRESS], dt, end)
-            return state.replace(x=x, v=v, C=C, F=F)
-
-        errors = self.step._error_status
-        with torch.inference_mode(False), torch.no_grad(), errors.passing_graphs():
-            self._replays = Replays(advanced, state, self.step.grid.pool(state.x, None))
-        self._in_flight, self._status = WorkInFlight(state.x), errors.status
+        return after
 
     def _continue_status(self) -> None:
         """Let the graph continue the status of steps that were computed without it."""
@@ -182,10 +161,35 @@ class GivenStressSteps:
         errors.status = self._status
 
     def _watch(self) -> None:
-        """Request the number of blocks of the latest step, unless a request is pending."""
+        """Request the number of blocks once in a while, and wait for it before the next request."""
+        grid = self.step.grid
+        self._unwatched += 1
+        if not grid.grows or self._unwatched < WATCHED:
+            return
         assert self._status is not None
-        self._unseen = self._unseen + 1 if self.step.grid.watches else 0
-        self.step.grid.watch(self._status)
+        grid.wait()
+        self._unwatched = 0
+        grid.watch(self._status)
+
+
+class _Graph:
+    """A function from particles and stress to particles as a CUDA graph."""
+
+    def __init__(self, function: Callable[..., Particles], given: tuple[Tensor, ...]) -> None:
+        x = given[0]
+        self._in_flight = WorkInFlight(x)
+        self._read = [copied(t) for t in given]
+        self._graph, self._memory = torch.cuda.CUDAGraph(), GraphMemory(x.device, waits=False)
+        with self._memory.capturing(self._graph):
+            self._ends = function(*self._read)
+
+    def replay(self, given: tuple[Tensor, ...]) -> Particles:
+        copy_all(self._read, given)
+        self._graph.replay()
+        self._in_flight.launched()
+        x, v, C, F = after = [torch.empty_like(t) for t in self._ends]
+        copy_all(after, self._ends)
+        return x, v, C, F
 
 
 def clamped(x: Tensor, lower: float | Tensor, upper: float | Tensor) -> Tensor:

@@ -146,9 +146,8 @@ class MPMSolver:
             self.time = time + self.dt
         self.displacement, self._now = None, time
         self._last, self._nodes = (x, v, C, F, stress, time), None
-        volume, mass = (self._of_particles(name, getattr(self, name), x) for name in ("vol", "p_mass"))
         result = self._steps(
-            *((x, v, C, F), stress, mass, volume, time, self.dt, self._ended),
+            *((x, v, C, F), stress, self._constants, time, self.dt, self._ended),
             (self.clip_bound, self.vol, self.p_mass) if self._is_plain() else None,
         )
         if recomputed:
@@ -186,8 +185,14 @@ class MPMSolver:
             )
         return last
 
+    def _constants(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Mass [kg] and volume [m³] of each particle."""
+        return self._of_particles("p_mass", self.p_mass, x), self._of_particles("vol", self.vol, x)
+
     def _of_particles(self, name: str, value: Any, x: Tensor) -> Tensor:
         """A number, or a tensor [], [1] or [P], as [P] in the dtype of positions."""
+        if isinstance(value, (int, float)):
+            return x.new_full((self.n_particles,), value)  # A copy from the host would wait for the device.
         tensor = torch.as_tensor(value, dtype=x.dtype, device=x.device)
         if tuple(tensor.shape) not in ((), (1,), (self.n_particles,)):
             raise ValueError(

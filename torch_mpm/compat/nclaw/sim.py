@@ -79,10 +79,15 @@ class MPMModel:
         """Particles a time step later. Particles that are not enabled are unchanged."""
         if not isinstance(statics, MPMStatics):
             raise TypeError(f"statics must be an MPMStatics, got {shape_of(statics)}")
-        volume = statics.vol.to(x)
-        mass, read = statics.rho.to(x) * volume, (statics.vol, statics.rho, statics.enabled, statics.clip_bound)
-        self._statics, plain = statics, self._is_plain()
-        return self._steps((x, v, C, F), stress, mass, volume, 0.0, self.dt, self._ended, read if plain else None)
+        self._statics = statics
+        read = (statics.vol, statics.rho, statics.enabled, statics.clip_bound) if self._is_plain() else None
+        return self._steps((x, v, C, F), stress, self._constants, 0.0, self.dt, self._ended, read)
+
+    def _constants(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Mass [kg] and volume [m³] of each particle."""
+        assert self._statics is not None
+        volume = self._statics.vol.to(x)
+        return self._statics.rho.to(x) * volume, volume
 
     def _is_plain(self) -> bool:
         """Whether nothing acts that the model has not set."""
