@@ -17,7 +17,7 @@ from typing import Any
 from . import common
 from .accuracy.limits import tables as limit_tables
 from .accuracy.runout import PUBLISHED, published, slopes
-from .speed import network_steps, roofline, scaling, thermal
+from .speed import doors, network_steps, roofline, scaling, thermal
 from .speed import training as speed_of_training
 from .speed.rollouts import row_beside, row_of_peer, row_of_steps
 from .speed.training_scripts import PROJECTS
@@ -138,6 +138,18 @@ def training(results: list[dict[str, Any]]) -> str:
         "\n".join(notes),
     ]
     return "\n\n".join(parts)
+
+
+def interfaces(results: list[dict[str, Any]]) -> str:
+    """Steps through the interfaces of other simulators beside rollouts."""
+    rows = ((r["environment"]["device"], r["particles"], *doors.row_of(row)) for r in results for row in r["rows"])
+    notes = "\n".join(f"- {common.describe(result['environment'])}" for result in results)
+    text = (
+        "Steps through the interfaces of other simulators, as their own programs call them, beside `rollout` with the "
+        "same options (benchmarks/speed/doors.py); float32, without gradients.\nThose that are called with a stress "
+        "return all fields of the particles in every step."
+    )
+    return "\n\n".join([text, common.table(("device", "particles", *doors.HEADER), rows), notes])
 
 
 def peers_of_training(results: list[dict[str, Any]], projects: Sequence[str]) -> str:
@@ -603,6 +615,7 @@ def sections(directory: Path) -> dict[str, str]:
         ("speed_*.json", "Speed", speed),
         ("rollouts_*.json", "Speed of rollouts and scenes", as_run),
         ("training_*.json", "Training", training),
+        ("doors_*.json", "Interfaces of other simulators", interfaces),
         ("datasets_*.json", "Data sets", data_sets),
         ("svd_*_*.json", "Small matrices and sand", small_matrices),
         ("heat_*_*.json", "Speed of the heat solve", heat_speed),
