@@ -554,10 +554,15 @@ def test_the_raw_op(device):
         *([], [], [], [], [], [], [], []),  # no heat
         *grid.packed,
     )
-    call = (*particles, *law, 2, 1e-4, True, 0.0, True, 0, *rest)
+    call = (*particles, *law, 2, 1e-4, True, [0.0, 1.0], True, 0, *rest)
     checks = ("test_schema", "test_faketensor", "test_aot_dispatch_dynamic")
-    for how in ((True, 0.0, True), (True, 0.9, True), (False, 1.0, True), (False, 0.0, False)):
-        given = (*call[:19], *how, *call[22:])
+    for apic, shares, wants_C in (
+        (True, [0.0, 1.0], True),
+        (True, [0.9, 0.5], True),
+        (False, [1.0, 1.0], True),
+        (False, [0.0, 0.0], False),
+    ):
+        given = (*call[:19], apic, shares, wants_C, *call[22:])
         torch.library.opcheck(torch.ops.torch_mpm.substeps.default, given, test_utils=checks)
     for wrong, place, message in (
         ("sand", 13, "law must be one of"),
@@ -565,7 +570,8 @@ def test_the_raw_op(device):
         ([scalar], 15, "parameters and history must have those of all laws"),
         (0, 17, "n must be 1 to 65536"),
         (-1.0, 18, "dt must be positive"),
-        (1.5, 20, "flip must be between 0 and 1"),
+        ([1.5, 1.0], 20, "velocity_shares must be between 0 and 1, got 1.5"),
+        ([0.0], 20, "velocity_shares must have 2 entries"),
         (x[:3], 7, r"residual must have shape \[40, 3\]"),
     ):
         with pytest.raises(RuntimeError, match=message):

@@ -220,7 +220,7 @@ class _Calls:
         who = (self.scene, ids, material, self.blocks.status)
         laws = ("neo_hookean,von_mises,weakly_compressible", [0, 0, 0])
         counts = [len(LAWS[name].parameters) for name in laws[0].split(",")]
-        how = ([ones] * sum(counts), [0, 1, 0], 3, 1e-3, True, 0.0, True, 0, self.normal(2, D), *self.walls)
+        how = ([ones] * sum(counts), [0, 1, 0], 3, 1e-3, True, [0.0, 1.0], True, 0, self.normal(2, D), *self.walls)
         impulse = self.normal(2, 6 + 2 * D, D + (1 if D == 2 else 3)).double()
         clocks = self.dt, self.uniform(2).double()
         nothing = ([], [], [], [], [], [], [], [])
