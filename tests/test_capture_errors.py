@@ -1,15 +1,18 @@
 """Graphs that are captured, dropped or fail: streams, allocator and memory are left as they were."""
 
 import contextlib
+import gc
 import os
 import subprocess
 import sys
+import weakref
 
 import pytest
 import torch
 
 import torch_mpm as mpm
-from torch_mpm.cuda_graphs.memory import on_own_stream
+from torch_mpm.cuda_graphs.capture import capturing
+from torch_mpm.cuda_graphs.memory import GraphMemory, on_own_stream
 
 F64 = torch.float64
 CYCLES = 200_000_000  # of a kernel that runs for a tenth of a second
@@ -119,3 +122,49 @@ def test_memory_of_graphs_that_await_their_backward_pass_is_not_given_away():
     reference = torch.autograd.grad(end(None, start).square().sum(), start)[0]
     for x, v in ((first, start), (second, again)):
         torch.testing.assert_close(torch.autograd.grad(x.square().sum(), v)[0], reference, rtol=1e-12, atol=0)
+
+
+class FakeGraph:
+    """Counts the cycles of references that are collected between the begin and the end of a capture."""
+
+    def __init__(self):
+        self.collected = []
+
+    def capture_begin(self, pool, capture_error_mode):
+        holder = type("Holder", (), {})()
+        holder.itself = holder
+        weakref.finalize(holder, self.collected.append, "in a capture")
+
+    def capture_end(self):
+        self.at_the_end = list(self.collected)
+
+
+def test_no_cycle_is_collected_during_a_capture():
+    """Such a cycle may hold a graph, whose destruction invalidates the capture."""
+    graph = FakeGraph()
+    with capturing(graph, (0, 0), torch.device("cuda", 0)):
+        assert not gc.isenabled()
+        [[] for _ in range(10 * max(gc.get_threshold()))]
+        kept = [[k] for k in range(10_000)]
+    assert gc.isenabled() and len(kept) == 10_000 and graph.at_the_end == []
+    gc.collect()
+    assert graph.collected == ["in a capture"]
+
+
+@pytest.mark.cuda
+def test_a_graph_in_a_cycle_does_not_end_a_capture():
+    """Solvers and their steps refer to each other; many of them come and go between captures."""
+    for _ in range(20):
+        _, state = blob()
+        memory = GraphMemory(state.x.device, waits=False)
+        for _ in range(2):  # The first graph of a memory is stored, the second one is destroyed.
+            cycle = {"graph": torch.cuda.CUDAGraph()}
+            cycle["itself"] = cycle
+            with memory.capturing(cycle["graph"]):
+                state.x + 1
+        del cycle
+        graph = torch.cuda.CUDAGraph()
+        with memory.capturing(graph):
+            found = [[state.x * k] for k in range(300)]
+        graph.replay()
+        torch.testing.assert_close(found[2][0], 2 * state.x)

@@ -145,4 +145,4 @@ def test_calls_of_one_kind_replay(device):
     for _ in range(2):
         state = call(*state)
     step = call.__closure__[0].cell_contents._steps
-    assert step._replays is not None
+    assert step._graph is not None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import collections
 import contextlib
 import copy
+import gc
 from collections.abc import Callable, Hashable, Iterator
 from typing import Any
 
@@ -31,9 +32,10 @@ def capturing(graph: torch.cuda.CUDAGraph, memory: Any, device: torch.device) ->
     """
     pool = torch.cuda.graph_pool_handle() if memory is None else memory
     try:
-        graph.capture_begin(pool, capture_error_mode="thread_local")
-        yield
-        graph.capture_end()
+        with _without_garbage_collection():
+            graph.capture_begin(pool, capture_error_mode="thread_local")
+            yield
+            graph.capture_end()
     except BaseException:
         with contextlib.suppress(RuntimeError):  # The original exception states why the capture failed.
             graph.capture_end()
@@ -42,6 +44,18 @@ def capturing(graph: torch.cuda.CUDAGraph, memory: Any, device: torch.device) ->
         with contextlib.suppress(RuntimeError):
             torch._C._cuda_endAllocateToPool(device.index, pool)
         raise
+
+
+@contextlib.contextmanager
+def _without_garbage_collection() -> Iterator[None]:
+    """A graph in a cycle of references is destroyed by the garbage collector, which invalidates a capture."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 def is_traced(x: Tensor) -> bool:
