@@ -168,7 +168,11 @@ def test_gradients_are_those_of_the_published_step(run, name):
 
 @pytest.mark.parametrize(
     ("damping", "scale", "words"),
-    [(0.35, 1.0, "on_particles, DampedAffine"), (0.0, 0.9, "torch operations, Damping")],
+    [
+        (0.35, 1.0, "on_particles, DampedAffine"),
+        (0.0, 0.9, "all steps in one op"),
+        (0.0, torch.tensor(0.9), "torch operations, Damping"),
+    ],
 )
 def test_explain_names_what_acts_step_by_step(damping, scale, words):
     sim = simulator("physgaussian", damping, scale)
