@@ -11,7 +11,6 @@ substeps, or one call of the solver and of its law per substep. Without gradient
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -25,6 +24,7 @@ from torch_mpm.compat.physgaussian import MPM_Simulator_WARP
 from torch_mpm.compat.warp_mpm import MPMModelStruct, MPMStateStruct, MPMWARPDiff
 
 from .. import common, regressions
+from .rollouts import least
 
 FRAME = 100
 """Substeps between two reads of the positions."""
@@ -32,7 +32,8 @@ SIDE = {"cpu": 22, "cuda": 46}
 E, NU, DENSITY, GRAVITY = 1e5, 0.3, 1000.0, (0.0, -1.0, 0.0)
 DT = 1e-5
 """A time step [s] in which the cube falls by few cells in all frames."""
-LEAST_SECONDS, LEAST_ROUNDS = 0.5, 3
+SAMPLES = 3
+"""Least number of measured frames."""
 
 Frame = Callable[[], object]
 """Computes FRAME substeps."""
@@ -46,11 +47,6 @@ def cube(side: int, device: str) -> tuple[int, Tensor, float]:
     return n, x.to(device), (0.5 / n) ** 3
 
 
-def rolled(step: mpm.Step, state: mpm.State) -> Frame:
-    step.prepare(state)
-    return lambda: mpm.rollout(step, state, FRAME, DT)
-
-
 def plain(side: int, device: str, damping: float = 1.0, **options: Any) -> Frame:
     """`torch_mpm.rollout`."""
     n, x, volume = cube(side, device)
@@ -59,7 +55,7 @@ def plain(side: int, device: str, damping: float = 1.0, **options: Any) -> Frame
     law = mpm.FixedCorotated(E=E, nu=NU)
     boundaries: list[Any] = [] if damping == 1 else [mpm.boundaries.Damping(damping)]
     step = mpm.Step(mpm.Grid(1 / n, (0.0,) * 3, (1.0,) * 3), law, GRAVITY, boundaries=boundaries, **options)
-    return rolled(step, state)
+    return lambda: mpm.rollout(step, state, FRAME, DT)
 
 
 def physgaussian(side: int, device: str, damping: float = 1.0, impulse: bool = False) -> Frame:
@@ -168,26 +164,17 @@ PAIRS: dict[str, tuple[Make, Make]] = {
 """Interfaces by name, and the rollout with the same options."""
 
 
-def seconds(frame: Frame, device: str) -> float:
-    """Least time of a frame [s], after one of warming up."""
+def microseconds(frame: Frame, device: str) -> float:
+    """Least time of a substep [us], after a frame of warming up."""
     frame()
-    times: list[float] = []
-    while len(times) < LEAST_ROUNDS or sum(times) < LEAST_SECONDS:
-        if device == "cuda":
-            torch.cuda.synchronize()
-        begin = time.perf_counter()
-        frame()
-        if device == "cuda":
-            torch.cuda.synchronize()
-        times.append(time.perf_counter() - begin)
-    return min(times)
+    return 1e6 / FRAME * least(device, frame, SAMPLES)
 
 
 @torch.no_grad()
 def measure(device: str, side: int) -> dict[str, Any]:
     result: dict[str, Any] = {"environment": common.environment(device), "particles": side**3, "rows": []}
     for name, (door, beside) in PAIRS.items():
-        own, rollout = (1e6 / FRAME * seconds(make(side, device), device) for make in (door, beside))
+        own, rollout = (microseconds(make(side, device), device) for make in (door, beside))
         result["rows"].append({"name": name, "us": own, "rollout": rollout})
         print(common.table(HEADER, [row_of(result["rows"][-1])]).splitlines()[-1], flush=True)
     return result
