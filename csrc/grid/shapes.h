@@ -10,6 +10,12 @@ enum class ObstacleShape : int { plane, sphere, box, capsule, revolved, sampled,
 
 inline namespace TORCH_MPM_ISA {
 
+// The corner at the end of edge k of a polygon.
+template <class T>
+MPM_HD const T* end_of_edge(const T* corner, int corners, int k) {
+  return corner + 2 * (k + 1 < corners ? k + 1 : 0);
+}
+
 // From the nearest point of the edge between two corners to a point (distance from the axis, position along it).
 template <class S>
 MPM_HD Vector<S, 2> offset_from_edge(const ValueOf<S>* a, const ValueOf<S>* b, const Vector<S, 2>& p) {
@@ -45,9 +51,8 @@ MPM_HD S polygon_surface(const ValueOf<S>* corner, int corners, const Vector<S, 
   Vector<T, 2> foot = zero_vector<T, 2>();
   int first = -1;
   bool inside = false;
-  const auto end_of = [&](int k) { return corner + 2 * (k + 1 < corners ? k + 1 : 0); };
   for (int k = 0; k < corners; k++) {
-    const T *const a = corner + 2 * k, *const b = end_of(k);
+    const T *const a = corner + 2 * k, *const b = end_of_edge(corner, corners, k);
     const Vector<S, 2> edge = {{lift<S>(b[0] - a[0]), lift<S>(b[1] - a[1])}};
     // An odd number of edges is crossed by the ray from the point away from the axis.
     const S side = edge[0] * (p[1] - lift<S>(a[1])) - edge[1] * (p[0] - lift<S>(a[0]));
@@ -71,7 +76,7 @@ MPM_HD S polygon_surface(const ValueOf<S>* corner, int corners, const Vector<S, 
   const T depth = value_of(nearest);
   T gap = std::numeric_limits<T>::max();
   for (int k = 0; k < corners; k++) {
-    const T *const a = corner + 2 * k, *const b = end_of(k);
+    const T *const a = corner + 2 * k, *const b = end_of_edge(corner, corners, k);
     if (k == first || (a[0] == T(0) && b[0] == T(0))) continue;
     if (is_nearly_as_deep(a, b, point, depth)) {
       second = depth;
@@ -90,7 +95,7 @@ template <class S>
 MPM_HD S edge_height(const ValueOf<S>* corner, int corners, int k, const Vector<S, 2>& p, Vector<S, 2>& normal,
                      ValueOf<S>& beyond) {
   using T = ValueOf<S>;
-  const T *const a = corner + 2 * k, *const b = corner + 2 * (k + 1 < corners ? k + 1 : 0);
+  const T *const a = corner + 2 * k, *const b = end_of_edge(corner, corners, k);
   const Vector<S, 2> edge = {{lift<S>(b[0] - a[0]), lift<S>(b[1] - a[1])}};
   const Vector<S, 2> arm = {{p[0] - lift<S>(a[0]), p[1] - lift<S>(a[1])}};
   normal = direction(Vector<S, 2>{{edge[1], S(0) - edge[0]}});
