@@ -8,15 +8,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..cuda_graphs.capture import NUMBERS, Same, is_eager
-from ..cuda_graphs.graph import WorkInFlight, copied, copy_all
+from ..cuda_graphs.capture import NUMBERS, Same
+from ..cuda_graphs.graph import Graphs, WorkInFlight, copy_all
 from ..cuda_graphs.keys import StepKey, surroundings
-from ..cuda_graphs.memory import GraphMemory
 from ..errors import check_like
 from ..laws import Material
-from ..laws.parameters import has_hooks
 from ..ops.precision import from_half
-from ..rollouts.anomaly import detecting
+from ..rollouts.graph_segments import another_device
+from ..rollouts.reasons import why_not_captured
 from ..state.state import State
 from ..step.step import Step
 
@@ -58,7 +57,8 @@ class GivenStressSteps:
 
     def _forget(self) -> None:
         self._kind: Hashable = None
-        self._graph: _Graph | None = None
+        self._graph: Graphs | None = None
+        self._in_flight: WorkInFlight | None = None
         self._status: Tensor | None = None  # of the graph
         self._unwatched = 0  # replays since the latest request of the number of blocks
 
@@ -118,14 +118,14 @@ class GivenStressSteps:
     def _kind_of(self, given: tuple[Tensor, ...], dt: float, read: list[Any]) -> Hashable:
         """Key of calls with one graph; None for those without one."""
         x, step = given[0], self.step
-        if not isinstance(x, Tensor) or not x.is_cuda or not is_eager(x) or detecting() or type(step) is not Step:
+        if not isinstance(x, Tensor) or not x.is_cuda or type(step) is not Step or step.heat is not None:
             return None
-        if step.integrator is not None or step.heat is not None or any([has_hooks(m) for m in step.modules()]):
+        if why_not_captured(step, dt, x) is not None or another_device(step, x.device) is not None:
             return None
         fixed = [*(value for value in read if isinstance(value, Tensor)), *step.parameters(), *step.buffers()]
         if torch.is_grad_enabled() and any([t.requires_grad for t in (*given, *fixed)]):
             return None
-        if any([t.device != x.device for t in fixed]) or not all([isinstance(r, (Tensor, *NUMBERS)) for r in read]):
+        if any([r.device != x.device if isinstance(r, Tensor) else not isinstance(r, NUMBERS) for r in read]):
             return None
         fields = tuple([(t.shape, t.dtype, t.device) for t in given])
         contents = tuple([Same(value) if isinstance(value, Tensor) else value for value in read])
@@ -142,13 +142,18 @@ class GivenStressSteps:
             self._forget()
             self._kind = kind, blocks
             return stepped(*given)
-        if self._graph is None:
+        if self._graph is None or self._in_flight is None:
             with torch.inference_mode(False), torch.no_grad(), step._error_status.passing_graphs():
-                self._graph, self._status = _Graph(stepped, given), step._error_status.status
+                self._graph = Graphs(stepped, given, [False] * len(given))
+                self._graph.capture(None)
+            self._in_flight, self._status = WorkInFlight(x), step._error_status.status
         self._continue_status()
-        after = self._graph.replay(given)
+        ends = self._graph.forward(given)
+        self._in_flight.launched()
+        x, v, C, F = after = [torch.empty_like(t) for t in ends]
+        copy_all(after, ends)  # in one kernel
         self._watch()
-        return after
+        return x, v, C, F
 
     def _continue_status(self) -> None:
         """Let the graph continue the status of steps that were computed without it."""
@@ -170,26 +175,6 @@ class GivenStressSteps:
         grid.wait()
         self._unwatched = 0
         grid.watch(self._status)
-
-
-class _Graph:
-    """A function from particles and stress to particles as a CUDA graph."""
-
-    def __init__(self, function: Callable[..., Particles], given: tuple[Tensor, ...]) -> None:
-        x = given[0]
-        self._in_flight = WorkInFlight(x)
-        self._read = [copied(t) for t in given]
-        self._graph, self._memory = torch.cuda.CUDAGraph(), GraphMemory(x.device, waits=False)
-        with self._memory.capturing(self._graph):
-            self._ends = function(*self._read)
-
-    def replay(self, given: tuple[Tensor, ...]) -> Particles:
-        copy_all(self._read, given)
-        self._graph.replay()
-        self._in_flight.launched()
-        x, v, C, F = after = [torch.empty_like(t) for t in self._ends]
-        copy_all(after, self._ends)
-        return x, v, C, F
 
 
 def clamped(x: Tensor, lower: float | Tensor, upper: float | Tensor) -> Tensor:

@@ -132,6 +132,7 @@ class Graphs:
             with self._memory.capturing(self._backward):
                 self._found = self._gradients(ends, self._grads)
         self._ends = [t.detach() for t in ends]
+        del self._steps  # It may refer to the owner of the graphs, whose release a cycle would delay.
 
     def forward(self, given: Sequence[Tensor]) -> Sequence[Tensor]:
         """The results, in memory that the next replay overwrites."""

@@ -73,7 +73,7 @@ def why_not_fused(step: Any, state: State, n: int, dt: float | Tensor) -> str | 
         return "there are hooks"
     _, obstacles = split_damping(boundaries.entries)
     if len(obstacles) < len(boundaries.entries) and state.impulse is not None:
-        return "impulses on boundaries are counted, of which damping is one"
+        return "the state counts impulses on boundaries, and the op counts none on damping"
     others = [b for b in obstacles if not (isinstance(b, Obstacle) and fusible(b, 0.0, paths=True))]
     if others:
         return f"a boundary acts by torch operations, {type(others[0]).__name__}"
@@ -112,11 +112,11 @@ def _why_not_eager(x: Tensor) -> str | None:
     return "anomaly detection inspects every step" if detecting() else None
 
 
-def _why_not_captured(step: nn.Module, steps: Steps, state: State) -> str | None:
-    """Reason why steps of a module cannot be captured in CUDA graphs; None if they can."""
-    if isinstance(steps.dt, Tensor):
+def why_not_captured(step: nn.Module, dt: float | Tensor, x: Tensor) -> str | None:
+    """Reason why steps of a module from positions x cannot be captured in CUDA graphs; None if they can."""
+    if isinstance(dt, Tensor):
         return "dt is a tensor"
-    if (reason := _why_not_eager(state.x)) is not None:
+    if (reason := _why_not_eager(x)) is not None:
         return reason
     if any(has_hooks(module) for module in step.modules()):
         return "there are hooks"
@@ -136,7 +136,7 @@ def why_not_replay(steps: Steps, state: State) -> str | None:
         return "it is not a plain Step"
     if not state.x.is_cuda:
         return "there are no graphs on the CPU"
-    if (reason := _why_not_captured(step, steps, state)) is not None:
+    if (reason := why_not_captured(step, steps.dt, state.x)) is not None:
         return reason
     if isinstance(state.time, Tensor):
         return "the time of the state is a tensor"
@@ -154,7 +154,7 @@ def why_not_graphs(steps: Steps, state: State) -> str | None:
         return "it is no module"
     if not graph_segments.has_graphs(state.x.device):
         return "there are no graphs on the CPU"
-    if (reason := _why_not_captured(step, steps, state)) is not None:
+    if (reason := why_not_captured(step, steps.dt, state.x)) is not None:
         return reason
     if (place := graph_segments.another_device(step, state.x.device)) is not None:
         return f"a tensor of it is on {place}, the particles on {state.x.device}"

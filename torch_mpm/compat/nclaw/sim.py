@@ -9,8 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from ...boundaries import Walls
-from ...cuda_graphs.capture import DeviceConstantCache
 from ...errors import check_count, check_number, shape_of
+from ...geometry.values import filled
 from ...grid.grid import Blocks, Grid
 from ...laws.parameters import TensorModule
 from ...state.state import State
@@ -123,24 +123,13 @@ class HeavyNodes(TensorModule):
 
     def __init__(self, eps: float, gravity: Numbers, lower: float, upper: float) -> None:
         self.eps, self.gravity, self.lower, self.upper = eps, gravity, lower, upper
-        self._constants = DeviceConstantCache()
 
     def forward(self, blocks: Blocks, velocity: Tensor, mass: Tensor, dt: float) -> Tensor:
-        gravity, x, rounding = (
-            self._gravity_like(velocity),
-            blocks.node_positions(velocity.dtype),
-            1e-6 * blocks.grid.dx,
-        )
+        gravity = self.gravity.to(velocity) if isinstance(self.gravity, Tensor) else filled(self.gravity, velocity)
+        x, rounding = blocks.node_positions(velocity.dtype), 1e-6 * blocks.grid.dx
         v = (mass / (mass + self.eps))[:, None] * velocity + gravity * dt
         out = ((x <= self.lower + rounding) & (v < 0)) | ((x >= self.upper - rounding) & (v > 0))
         return torch.where(out, 0, v)
-
-    def _gravity_like(self, velocity: Tensor) -> Tensor:
-        if isinstance(self.gravity, Tensor):
-            return self.gravity.to(velocity)
-        key = velocity.dtype, velocity.device, *self.gravity
-        tensor: Tensor = self._constants.get(key, lambda: velocity.new_tensor(list(self.gravity)), velocity)
-        return tensor
 
 
 class MPMModelBuilder:
