@@ -23,7 +23,7 @@ def free(device, boundaries, dim=2, dtype=F64, **options):
 
 @pytest.mark.parametrize("transfer", TRANSFERS)
 def test_a_body_without_forces_decays_by_the_share(transfer, dim, device):
-    """v = v0 s^n, and x = x0 + v0 dt (s + ... + s^n); FLIP keeps what damping takes as well."""
+    """v = v0 s^n, and x = x0 + v0 dt (s + ... + s^n). With FLIP particles have the velocity of their nodes, too."""
     share = 0.93
     step, state = free(device, [Damping(share)], dim, **TRANSFERS[transfer])
     end = mpm.rollout(step, state, N, DT)
