@@ -2,7 +2,6 @@
 
 import hashlib
 import itertools
-import zlib
 
 import numpy as np
 import pytest
@@ -10,7 +9,9 @@ import torch
 
 pytest.importorskip("isal")
 
-from torch_mpm.data.packing import CHUNK_BYTES, PIECE_BYTES, Packing, content_hash, packed, prepare_scene
+from cases.packed import unpacked
+
+from torch_mpm.data.packing import PIECE_BYTES, Packing, content_hash, packed, prepare_scene
 from torch_mpm.data.statistics import BOUNDARY, MotionSums, motion_sums
 
 SHAPES = [(50, 700, 2), (7, 300, 3, 3), (3, 20_000, 3), (1, 5, 2), (40_000, 3), (9, 1, 1)]
@@ -18,18 +19,6 @@ SHAPES = [(50, 700, 2), (7, 300, 3, 3), (3, 20_000, 3), (1, 5, 2), (40_000, 3), 
 
 def values_of(shape, dtype=np.float32, seed=0):
     return (1e3 * np.random.default_rng(seed).standard_normal(shape).cumsum(0)).astype(dtype)
-
-
-def unpacked(stored):
-    """By zlib and transposition, as HDF5's filters do it."""
-    rows = []
-    for chunk in map(zlib.decompress, stored.chunks):
-        elements = np.frombuffer(chunk, np.uint8).reshape(stored.dtype.itemsize, -1).T
-        rows.append(np.ascontiguousarray(elements).view(stored.dtype).reshape(-1, *stored.shape[1:]))
-        assert len(rows[-1]) == stored.chunk_frames and rows[-1].nbytes <= max(CHUNK_BYTES, rows[-1][:1].nbytes)
-    joined = np.concatenate(rows)
-    assert not joined[stored.shape[0] :].any()
-    return joined[: stored.shape[0]]
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64, np.int8])
