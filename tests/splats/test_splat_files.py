@@ -81,10 +81,11 @@ def test_what_is_written_is_read(degree, tmp_path):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("degree", [0, 1, 3])
 def test_the_bytes_of_a_file(degree, dtype, device, tmp_path):
-    """Columns of numpy in the order of the header, for harmonics of other strides too."""
+    """Columns of numpy in the order of the header, for harmonics of other strides and with gradients too."""
     made = random_gaussians(40, degree, dtype).to(device)
     made = made.replace(harmonics=made.harmonics.mT.contiguous().mT)
-    splats.write(tmp_path / "a.ply", made)
+    with_gradients = {name: getattr(made, name).clone().requires_grad_() for name in ("x", "axes", "harmonics")}
+    splats.write(tmp_path / "a.ply", made.replace(**with_gradients))
     deviation, quaternion = made.factors()
     parts = (made.x, 0 * made.x, made.harmonics, made.opacity_logit[:, None], deviation.log(), quaternion)
     x, normal, harmonics, *others = (part.cpu().numpy() for part in parts)

@@ -67,7 +67,7 @@ class FrameWriter:
         return self
 
     def write(self, path: str | os.PathLike[str], gaussians: Gaussians) -> None:
-        """Write the file of a frame soon; the Gaussians may change after the return.
+        """Queue the file of a frame; the Gaussians may change after the return.
 
         Raises:
             RuntimeError: outside of the context.
