@@ -169,7 +169,7 @@ def main(
     pictures = {}
     for name, made in scenes(file, frames, resolution, device).items():
         summary = made.run(out / name)
-        write_frames(out / name, made)
+        write_frames(out / name, made, torch.device(device))
         *pictures[name], _ = draw_frames(out / name, made, device=torch.device(device))
         print(f"{name}: {summary['particles']} particles, {summary['substeps']} substeps", flush=True)
     chosen = [round(share * frames) for share in (0.0, 0.25, 1.0)]

@@ -327,7 +327,7 @@ def _splat_outputs(scene: Any, options: argparse.Namespace) -> Outputs:
 
     def write() -> dict[str, Path]:
         with progress.frame_bar("splats", options.quiet) as shown:
-            return {"splats": write_frames(options.out, scene, shown)[0].parent}
+            return {"splats": write_frames(options.out, scene, scene.torch_device(), shown)[0].parent}
 
     def draw() -> dict[str, Path]:
         with progress.frame_bar("pictures", options.quiet) as shown:

@@ -10,7 +10,7 @@ import torch
 
 import torch_mpm as mpm
 from benchmarks.fuzz.mutations import refuses
-from torch_mpm import heat_boundaries
+from torch_mpm import heat_boundaries, splats
 from torch_mpm.geometry import seed
 from torch_mpm.implicit import Implicit
 
@@ -137,7 +137,7 @@ def _rollouts() -> dict[str, Callable[[], Call]]:
 
 
 def _particles() -> dict[str, Callable[[], Call]]:
-    """Operations on particles, and functions that join and split states."""
+    """Operations on particles, functions that join and split states, and files of splats."""
 
     def acting(kind: Callable[..., Any], /, **given: Any) -> Callable[[], Call]:
         def use(**arguments: Any) -> Any:
@@ -162,6 +162,7 @@ def _particles() -> dict[str, Callable[[], Call]]:
         "Present": acting(operations.Present),
         "Waypoints": waypoints,
         "State.split": lambda: (_limited(_World().batch()[1].split), dict(scenes=3)),
+        "splats.FrameWriter": lambda: (splats.FrameWriter, dict(threads=2, most=4)),
         "State.of_scenes": lambda: (_World().batch()[1].of_scenes, dict(scenes=3)),
     }
 

@@ -12,8 +12,9 @@ from helpers import result, run_quick, run_quick_here
 
 from benchmarks import common, report
 from benchmarks.accuracy import convergence, manufactured, ritter
-from benchmarks.speed import checkpoints, peers, step, work
+from benchmarks.speed import checkpoints, peers, splats, step, work
 from benchmarks.stability.stable_dt import LAWS
+from torch_mpm.splats import ply
 
 
 @pytest.mark.thorough
@@ -26,6 +27,21 @@ def test_speed_program_times_every_part(tmp_path: Path) -> None:
     assert {"activate", "stress", "p2g", "g2p", "grid update", "advance", "p2g with stress, backward"} <= names
     assert all(part["ms"] > 0 and part["bytes"] > 0 for part in size["parts"])
     assert max(size["errors"].values()) < 5e-6
+
+
+@pytest.mark.thorough
+def test_splats_program_times_runs_with_files(tmp_path: Path) -> None:
+    run_quick_here("benchmarks.speed.splats", tmp_path)
+    found = result(tmp_path, "splats_*.json")
+    (parts,) = found["runs"]
+    assert all(parts["seconds"][part] > 0 for part in splats.PARTS)
+    assert [run["degree"] for run in found["loops"]] == [0, 3]
+    for run in found["loops"]:
+        assert run["bytes"] == ply.size_of(2000, (run["degree"] + 1) ** 2)
+        assert run["frames"] == 3 and run["held_bytes"] == 3 * run["bytes"]
+        assert run["seconds"] > 0 and run["from_memory"] > 0
+    names = [name for name, _ in splats.timed_parts(found)]
+    assert len(set(names)) == len(names) == len(splats.PARTS) + 2
 
 
 def test_failed_part_is_reported_and_the_others_go_on(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,6 +1,8 @@
 """Scenes with objects of Gaussian splats: their particles, the files and pictures of a run, and the command."""
 
+import errno
 import json
+import os
 
 import numpy as np
 import pytest
@@ -66,13 +68,15 @@ def test_particles_of_an_object_among_others(folder):
 
 @pytest.mark.parametrize("material", [JELLY, {"law": "weakly_compressible", "bulk_modulus": 1e4}])
 @pytest.mark.parametrize("up", ["+y", "-z"])
-def test_files_of_the_frames(material, up, folder):
+def test_files_of_the_frames(material, up, device, folder):
     """The first one is the object in its place; later ones move with the particles, and deform with F or J."""
     bodies = [{**BALL, "material": "soft"}, {**OBJECT, "up": up}]
     materials = {"jelly": material, "soft": JELLY}
     scene = Scene.from_words(words(body=bodies, material=materials), folder=folder)
     scene.run(folder / "out")
-    paths = splat_frames.write_frames(folder / "out", scene)
+    shown = []
+    paths = splat_frames.write_frames(folder / "out", scene, torch.device(device), lambda *number: shown.append(number))
+    assert shown == [(k, 4) for k in range(4)]
     assert [path.name for path in paths] == ["00000.ply", "00001.ply", "00002.ply", "00003.ply"]
     rest = splats.read(folder / "ball.ply")
     rest = splats.placed(rest[splats.visible(rest)], up, 0.3, (0.6, 0.4, 0.5))
@@ -109,6 +113,29 @@ def test_a_full_disk_is_known_before(folder, monkeypatch):
     with pytest.raises(splat_frames.OutputError, match=r"the splats need .* where 1 kB are free"):
         splat_frames.write_frames(folder / "out", scene)
     assert not (folder / "out" / "splats").exists()
+
+
+def test_files_continue_after_a_full_disk(folder, monkeypatch):
+    """Files before the fault are complete, and are not written again."""
+    scene = Scene.from_words(words(), folder=folder)
+    scene.run(folder / "out")
+    run, synchronise, done = folder / "out" / "splats", os.fsync, []
+
+    def fails_once(handle):
+        done.append(handle)
+        if len(done) == 2:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        synchronise(handle)
+
+    monkeypatch.setattr(os, "fsync", fails_once)
+    with pytest.raises(splat_frames.OutputError, match=r"no room on the disk of .*splats: .* add --resume"):
+        splat_frames.write_frames(folder / "out", scene)
+    kept = {path: path.stat().st_mtime_ns for path in run.iterdir()}
+    assert len(kept) < 4 and all(path.suffix == ".ply" and not path.name.startswith(".") for path in kept)
+    paths = splat_frames.write_frames(folder / "out", scene)
+    assert {path: path.stat().st_mtime_ns for path in kept} == kept
+    assert sorted(run.iterdir()) == paths and len({path.stat().st_size for path in paths}) == 1
+    assert float(splats.read(paths[3]).x.mean()) > float(splats.read(paths[0]).x.mean())
 
 
 def test_another_object_than_that_of_the_run_is_refused(folder):

@@ -78,6 +78,24 @@ def test_what_is_written_is_read(degree, tmp_path):
     assert not list(tmp_path.glob("*building*"))
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_the_bytes_of_a_file(degree, dtype, device, tmp_path):
+    """Columns of numpy in the order of the header, for harmonics of other strides and with gradients too."""
+    made = random_gaussians(40, degree, dtype).to(device)
+    made = made.replace(harmonics=made.harmonics.mT.contiguous().mT)
+    with_gradients = {name: getattr(made, name).clone().requires_grad_() for name in ("x", "axes", "harmonics")}
+    splats.write(tmp_path / "a.ply", made.replace(**with_gradients))
+    deviation, quaternion = made.factors()
+    parts = (made.x, 0 * made.x, made.harmonics, made.opacity_logit[:, None], deviation.log(), quaternion)
+    x, normal, harmonics, *others = (part.cpu().numpy() for part in parts)
+    higher = [harmonics[:, 1:, channel] for channel in range(3)]
+    rows = np.concatenate([x, normal, harmonics[:, 0], *higher, *others], 1).astype("<f4")
+    lines = [f"property float {name}" for name in ply.names_of((degree + 1) ** 2)]
+    head = ["ply", "format binary_little_endian 1.0", "element vertex 40", *lines, "end_header\n"]
+    assert (tmp_path / "a.ply").read_bytes() == "\n".join(head).encode() + rows.tobytes()
+
+
 def test_meshio_reads_what_is_written(tmp_path):
     meshio = pytest.importorskip("meshio")
     before = random_gaussians(7, 1, torch.float32)

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from ..data.hdf5 import h5py_module
+from ..data.host_copies import Copier, Copies
 from ..data.trajectory import PARTIAL, Layout, Trajectory, TrajectoryWriter
 from ..data.whole_files import remove_leftovers
 from ..errors import DamagedFileError, SimulationError
@@ -32,7 +33,7 @@ from .folder import CHECKPOINT, LAST_GOOD, claim, finished, locked, output_error
 from .process import StopSignals, prompt_turns
 from .scene import Scene
 from .substeps import check_substeps
-from .writer import Copier, Copies, Frame, FrameWriter
+from .writer import Frame, FrameWriter
 
 SEGMENT = 32
 """Substeps between two checks of the stability limit and the validity of the state, and between two reorderings."""

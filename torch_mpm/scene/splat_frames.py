@@ -13,7 +13,7 @@ from ..data.host_memory import in_words
 from ..data.trajectory import Array, Trajectory
 from ..data.whole_files import output_folder, output_path
 from ..errors import DamagedFileError
-from ..splats import Gaussians, concatenate, deformed, write
+from ..splats import FrameWriter, Gaussians, concatenate, deformed
 from ..splats.motion import deformation
 from ..splats.ply import size_of
 from . import schema, splat_bodies
@@ -28,7 +28,12 @@ Progress = Callable[[int, int], None]
 
 
 class SplatFrames:
-    """Gaussians of the bodies of a run in its frames, relative to the origin of the scene, on the CPU.
+    """Gaussians of the bodies of a run in its frames, relative to the origin of the scene.
+
+    Args:
+        scene: scene of the run.
+        trajectory: its frames.
+        device: where the Gaussians are computed; None for the CPU.
 
     Raises:
         SceneError: for a scene without splats, or a batch of scenes.
@@ -36,12 +41,12 @@ class SplatFrames:
         OSError, ValueError: for a file of a body that cannot be read.
     """
 
-    def __init__(self, scene: Scene, trajectory: Trajectory) -> None:
+    def __init__(self, scene: Scene, trajectory: Trajectory, device: torch.device | None = None) -> None:
         check_scene(scene)
         self._origin = scene.origin
         (entry,) = scene.entries()
         bodies = [body for body in entry.body if isinstance(body, schema.SplatsBody)]
-        self.rest = concatenate([splat_bodies.loaded(scene, entry, body) for body in bodies])
+        self.rest = concatenate([splat_bodies.loaded(scene, entry, body) for body in bodies]).to(device)
         number = trajectory["gaussian"] if "gaussian" in trajectory.file else np.empty(0)
         self.rows = np.flatnonzero(number >= 0)
         """Particles with a Gaussian, in its order."""
@@ -53,11 +58,11 @@ class SplatFrames:
         """Particles of other bodies."""
         names = trajectory.names("material")
         fluid = np.array([isinstance(scene.material[name], schema.WeaklyCompressible) for name in names])
-        self._fluid = torch.from_numpy(fluid[trajectory["material"][self.rows]])
+        self._fluid = torch.from_numpy(fluid[trajectory["material"][self.rows]]).to(device)
 
     def of(self, frame: dict[str, Array]) -> Gaussians:
         """Deformed Gaussians of a frame of the trajectory."""
-        x = torch.from_numpy(self.positions(frame, self.rows)).to(self.rest.x.dtype)
+        x = torch.from_numpy(self.positions(frame, self.rows)).to(self.rest.x)
         moved = deformation(x, None, None)
         if "F" in frame:
             moved = torch.where(self._fluid[:, None, None], moved, self._values(frame, "F"))
@@ -72,7 +77,7 @@ class SplatFrames:
         return x if self._origin is None else x - np.array(self._origin)
 
     def _values(self, frame: dict[str, Array], name: str) -> torch.Tensor:
-        return torch.from_numpy(frame[name][self.rows]).to(self.rest.x.dtype)
+        return torch.from_numpy(frame[name][self.rows]).to(self.rest.x)
 
 
 def check_scene(scene: Scene) -> None:
@@ -83,10 +88,18 @@ def check_scene(scene: Scene) -> None:
         raise SceneError(['body: there is none with shape = "splats"'], scene.source)
 
 
-def write_frames(folder: str | Path, scene: Scene, progress: Progress | None = None) -> list[Path]:
+def write_frames(
+    folder: str | Path, scene: Scene, device: torch.device | None = None, progress: Progress | None = None
+) -> list[Path]:
     """Write the Gaussians of each frame of a run: splats/00000.ply, ... in its folder; returns the paths.
 
-    Existing files are complete, and are not written again. ``progress(frame, frames)`` is called after each file.
+    Existing files are complete, and are not written again.
+
+    Args:
+        folder: folder of the run.
+        scene: its scene.
+        device: where the Gaussians are computed; None for the CPU.
+        progress: called with (frame, frames) when a frame is computed; threads write the files.
 
     Raises:
         OutputError: for a full disk, before it is full if it is known.
@@ -94,14 +107,15 @@ def write_frames(folder: str | Path, scene: Scene, progress: Progress | None = N
     """
     target = output_path(Path(folder), FOLDER)
     with Trajectory(folder) as trajectory, output_errors(target, KEPT), output_folder(target):
-        frames = SplatFrames(scene, trajectory)
+        frames = SplatFrames(scene, trajectory, device)
         paths = [target / f"{k:05d}.ply" for k in range(len(trajectory))]
         missing = [(k, path) for k, path in enumerate(paths) if not path.exists()]
         _require_room(target, len(missing) * size_of(len(frames.rest), frames.rest.harmonics.shape[1]))
-        for k, path in missing:
-            write(path, frames.of(trajectory.frame(k)))
-            if progress is not None:
-                progress(k, len(paths))
+        with FrameWriter() as files:
+            for k, path in missing:
+                files.write(path, frames.of(trajectory.frame(k)))
+                if progress is not None:
+                    progress(k, len(paths))
     return paths
 
 

@@ -16,50 +16,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..data.host_copies import Copies
 from ..data.trajectory import TrajectoryWriter
 from ..state import state_file
 
 CHECKPOINT_SECONDS = 1.0
 """Minimum time between two checkpoints [s]: the work that a killed run may have to recompute."""
-
-
-@dataclass(frozen=True)
-class Copies:
-    """Fields of a frame in host memory. ``ready`` is recorded after the copies; ``sources`` keeps their origin alive
-    until then.
-    """
-
-    fields: Mapping[str, Tensor]
-    ready: torch.cuda.Event | None
-    sources: list[Tensor]
-
-
-class Copier:
-    """Copies of tensors into host memory: on CUDA on a separate stream, so that nothing waits."""
-
-    def __init__(self) -> None:
-        self._stream: Any = None
-
-    def begin(self, fields: Mapping[str, Tensor]) -> Copies:
-        """Copies that may be pending."""
-        sources = list(fields.values())
-        device = sources[0].device
-        if device.type != "cuda":
-            return Copies(fields, None, sources)
-        if self._stream is None:
-            self._stream = torch.cuda.Stream(device)
-        self._stream.wait_stream(torch.cuda.current_stream(device))
-        with torch.cuda.stream(self._stream):
-            host = {name: _pinned(t).copy_(t, non_blocking=True) for name, t in fields.items()}
-            ready = torch.cuda.Event()
-            ready.record(self._stream)
-        return Copies(host, ready, sources)
-
-
-def _pinned(t: Tensor) -> Tensor:
-    """Buffer for a tensor in pinned memory, row after row, as in files."""
-    return torch.empty(t.shape, dtype=t.dtype, device="cpu", pin_memory=True)
-
 
 _stream_of = functools.cache(torch.cuda.Stream)
 """Stream of a device for copies of checkpoints: only one, since torch hands out 32 streams in turn, and work of another
@@ -157,11 +119,7 @@ class FrameWriter:
         self.seconds += time.perf_counter() - begin
 
     def _write(self, frame: Frame) -> None:
-        copies = frame.copies
-        if copies.ready is not None:
-            copies.ready.synchronize()
-            copies.sources.clear()
-        values = {k: v.numpy() for k, v in copies.fields.items()} | {k: np.asarray(v) for k, v in frame.scalars.items()}
+        values = frame.copies.arrays() | {k: np.asarray(v) for k, v in frame.scalars.items()}
         self.trajectory.write(frame.number, values)
         self._unsaved = frame
         if time.perf_counter() - self._saved >= CHECKPOINT_SECONDS:

@@ -9,6 +9,7 @@ end = mpm.rollout(step, state, n=100, dt=1e-4)
 splats.write("end.ply", splats.moved(mug, end))
 """
 
+from .frame_writer import FrameWriter
 from .gaussians import Gaussians, concatenate
 from .harmonics import basis, colors, rotated
 from .interior import Interior, Lattice, enclosed, opacity_field
@@ -19,6 +20,7 @@ from .placement import placed
 from .ply import read, write
 
 __all__ = [
+    "FrameWriter",
     "Gaussians",
     "Interior",
     "Lattice",

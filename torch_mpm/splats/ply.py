@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from ..data.host_copies import copied
 from ..data.whole_files import replacing
 from ..geometry import point_files
 from ..geometry.surface_mesh import Array
 from .gaussians import Gaussians, check_gaussians
 from .harmonics import COUNTS
 
+Rows = npt.NDArray[np.float32]
 COLOR = tuple(f"f_dc_{k}" for k in range(3))
 SCALE = tuple(f"scale_{k}" for k in range(3))
 ROTATION = tuple(f"rot_{k}" for k in range(4))
@@ -105,15 +108,22 @@ def write(path: str | os.PathLike[str], gaussians: Gaussians) -> int:
         ValueError: for Gaussians that are not finite.
     """
     check_gaussians(gaussians)
-    table = table_of(gaussians)
-    if not bool(np.isfinite(table).all()):
-        row = int(np.argmin(np.isfinite(table).all(1)))
-        raise ValueError(f"the Gaussians of {os.fspath(path)} must be finite, and number {row} is not")
-    header = header_of(len(gaussians), gaussians.harmonics.shape[1])
+    rows = rows_of(gaussians)
+    return write_rows(path, copied(rows).numpy(), float(rows.sum()), gaussians.harmonics.shape[1])
+
+
+def write_rows(path: str | os.PathLike[str], rows: Rows, total: float, harmonics: int) -> int:
+    """Write the file of some rows [N, properties] with their sum; the rest as `write`."""
+    if not math.isfinite(total):  # The sum of finite numbers may overflow too.
+        finite = np.isfinite(rows).all(1)
+        if not finite.all():
+            number = int(np.argmin(finite))
+            raise ValueError(f"the Gaussians of {os.fspath(path)} must be finite, and number {number} is not")
+    header = header_of(len(rows), harmonics)
     with replacing(path) as temporary, open(temporary, "wb") as file:
         file.write(header)
-        file.write(table.data)
-    return len(header) + table.nbytes
+        file.write(np.ascontiguousarray(rows, "<f4").data)
+    return len(header) + rows.nbytes
 
 
 def names_of(harmonics: int) -> list[str]:
@@ -132,17 +142,18 @@ def size_of(count: int, harmonics: int) -> int:
     return len(header_of(count, harmonics)) + 4 * count * len(names_of(harmonics))
 
 
-def table_of(gaussians: Gaussians) -> np.ndarray[Any, np.dtype[np.float32]]:
-    """Rows of a file, float32 [N, properties]."""
-    scale, quaternion = gaussians.factors()
-    columns = [
-        gaussians.x,
-        torch.zeros_like(gaussians.x),
-        gaussians.harmonics[:, 0],
-        gaussians.harmonics[:, 1:].mT.flatten(1),
-        gaussians.opacity_logit[:, None],
-        scale.log().clamp(min=SMALLEST_LOG),
-        quaternion,
-    ]
-    table = torch.cat([column.detach().to(torch.float32).cpu() for column in columns], 1)
-    return np.ascontiguousarray(table.numpy(), "<f4")
+@torch.no_grad()
+def rows_of(gaussians: Gaussians) -> Tensor:
+    """Rows of a file, float32 [N, properties], on the device of the Gaussians."""
+    N, K = gaussians.harmonics.shape[:2]
+    rows = gaussians.x.new_empty((N, len(names_of(K))), dtype=torch.float32)
+    x, normal, color, rest, opacity, scale, rotation = rows.split([3, 3, 3, 3 * (K - 1), 1, 3, 4], 1)
+    deviation, quaternion = gaussians.factors()
+    x.copy_(gaussians.x)
+    normal.zero_()
+    color.copy_(gaussians.harmonics[:, 0])
+    rest.unflatten(1, (3, K - 1)).copy_(gaussians.harmonics[:, 1:].mT)
+    opacity.copy_(gaussians.opacity_logit[:, None])
+    scale.copy_(deviation.log().clamp(min=SMALLEST_LOG))
+    rotation.copy_(quaternion)
+    return rows
