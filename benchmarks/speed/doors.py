@@ -121,6 +121,19 @@ def of_nclaw(side: int, device: str, eps: float = 0.0) -> Frame:
     return stepwise(lambda x, v, C, F: solver(statics, x, v, C, F, law(F)), x)
 
 
+def law_alone(side: int, device: str) -> Frame:
+    """The part of a frame of NCLaw that is no substep: its law, which is a program of torch operations."""
+    F = torch.eye(3, device=device).expand(side**3, 3, 3).contiguous()
+    law = nclaw.material.CorotatedElasticity({"E": E, "nu": NU}).to(device).requires_grad_(False)
+
+    def frame() -> Tensor:
+        for _ in range(FRAME):
+            stress = law(F)
+        return stress
+
+    return frame
+
+
 def of_mpm_pytorch(side: int, device: str) -> Frame:
     n, x, volume = cube(side, device)
     solver = mpm_pytorch.MPMSolver(x, num_grids=n, dt=DT, gravity=GRAVITY, rho=DENSITY, device=device)
@@ -157,6 +170,10 @@ PAIRS: dict[str, tuple[Make, Make]] = {
     "NCLaw": (of_nclaw, lambda side, device: plain(side, device, stress_form="mls", walls="separate")),
     "NCLaw, eps 1e-7": (
         lambda side, device: of_nclaw(side, device, 1e-7),
+        lambda side, device: plain(side, device, stress_form="mls", walls="separate"),
+    ),
+    "the law of NCLaw alone": (
+        law_alone,
         lambda side, device: plain(side, device, stress_form="mls", walls="separate"),
     ),
     "MPM-PyTorch": (of_mpm_pytorch, plain),
