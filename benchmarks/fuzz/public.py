@@ -99,6 +99,16 @@ def _rollouts() -> dict[str, Callable[[], Call]]:
         poses = torch.zeros(grid.scenes, 1, 6, dtype=torch.float64)
         return _limited(mpm.RigidBodies(step, [ball]).advance), dict(state=state, bodies=poses, n=2, dt=1e-4)
 
+    def of_free_bodies() -> Call:
+        w = _World()
+        grid, state = w.batch()
+        body = mpm.bodies.Body(mpm.Sphere((0.0, 0.0), 0.2), 3.0, 0.1)
+        bodies = mpm.bodies.FreeBodies(mpm.Step(grid, w.law), [body], gravity=(0.0, -1.0))
+        rows = torch.zeros(grid.scenes, 1, 6, dtype=torch.float64)
+        return _limited(bodies.advance), dict(
+            state=state, bodies=rows, n=2, dt=1e-4, wrenches=torch.ones_like(rows[..., 3:])
+        )
+
     def method(name: str, /, **given: Any) -> Callable[[], Call]:
         def make() -> Call:
             w = _World()
@@ -126,6 +136,7 @@ def _rollouts() -> dict[str, Callable[[], Call]]:
         "Environments": environments,
         "Environments.advance": advanced,
         "RigidBodies.advance": of_bodies,
+        "FreeBodies.advance": of_free_bodies,
         "Checkpoints": lambda: (mpm.Checkpoints, dict(every=2, offload=False)),
         "GradientNorms": lambda: (mpm.GradientNorms, dict(every=2)),
         "Step.stable_dt": method("stable_dt", cfl=0.5),

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -34,6 +34,7 @@ from ..cuda_graphs.capture import is_readable
 from ..errors import FLOATING, check_count, check_number, check_vector, shape_of
 from ..geometry.values import filled
 from ..geometry.vectors import composed, quaternion, rotation_vector
+from ..grid.grid import Grid
 from ..rollouts import rollout
 from ..state.state import State, check_state
 from ..step.step import Step
@@ -113,7 +114,7 @@ class RigidBodies:
         if not isinstance(bodies, Sequence):
             raise TypeError(f"bodies must be a list of obstacles, parts and lists of them, got {shape_of(bodies)}")
         self.step = step
-        self.parts = [_parts_of(k, body) for k, body in enumerate(bodies)]
+        self.parts = [parts_of(k, body) for k, body in enumerate(bodies)]
         known = {id(boundary) for boundary in step.boundaries}
         for k, parts in enumerate(self.parts):
             for part in parts:
@@ -123,7 +124,7 @@ class RigidBodies:
                         f"obstacles of body {k} must be boundaries of the step, and those of no other body"
                     )
                 known.remove(id(part.obstacle))
-        self._frames = _frames(self.parts, step.grid.dim)
+        self._frames = Frames.of(self.parts, step.grid.dim)
 
     def __len__(self) -> int:
         return len(self.parts)
@@ -143,18 +144,9 @@ class RigidBodies:
                 and quaternions whose length differs from 1 by more than a thousandth.
         """
         check_state(state)
-        self._check(bodies, state)
-        dim = self.step.grid.dim
-        owner, position, rotation = (values.to(bodies.device, non_blocking=True) for values in self._frames)
-        motion = Motion(*(values[:, owner] for values in motion_of(bodies.double(), dim)))
-        arm = (rotation_matrix(motion.rotation, dim) @ position[..., None])[..., 0]
-        of_obstacles = Motion(
-            motion.position + arm,
-            _turned(motion.rotation, rotation.expand_as(motion.rotation)),
-            motion.velocity + _swirl(motion.angular_velocity, arm),
-            motion.angular_velocity,
-        )
-        _assign([part.obstacle for parts in self.parts for part in parts], of_obstacles, state.time)
+        check_bodies(bodies, state, self.step.grid, len(self))
+        of_obstacles = self._frames.motion(motion_of(bodies.double(), self.step.grid.dim))
+        assign([part.obstacle for parts in self.parts for part in parts], of_obstacles, state.time)
 
     def impulses(self, before: State, after: State, about: Tensor | None = None) -> Tensor:
         """Impulses of the material on the bodies between two states.
@@ -210,23 +202,29 @@ class RigidBodies:
         seconds = n * dt.to(impulses).reshape(-1, 1, 1)
         return after, torch.where(seconds > 0, impulses / torch.where(seconds > 0, seconds, 1.0), 0.0)
 
-    def _check(self, bodies: Tensor, state: State) -> None:
-        grid = self.step.grid
-        columns = POSE[grid.dim] + VELOCITY[grid.dim]
-        shape = grid.scenes, len(self), columns
-        if not isinstance(bodies, Tensor) or bodies.shape != shape:
-            raise ValueError(f"bodies must have shape [B, K, {columns}] = {list(shape)}, got {shape_of(bodies)}")
-        if bodies.dtype not in FLOATING:
-            raise TypeError(f"bodies must be float32 or float64, got {bodies.dtype}")
-        if bodies.device != state.x.device:
-            raise ValueError(f"bodies must be on the device of the state, {state.x.device}, got {bodies.device}")
-        if not is_readable(bodies):
-            return
-        values = bodies.detach()
-        _check_rows(~values.isfinite().all(2), "bodies must be finite, got NaN or infinity")
-        if grid.dim == 3:
-            wrong = (values[..., 3:7].norm(dim=2) - 1).abs() > NOT_UNIT
-            _check_rows(wrong, "bodies must have unit quaternions w, x, y, z in columns 3 to 6, got another length")
+
+def check_bodies(bodies: Any, state: State, grid: Grid, count: int) -> None:
+    """Check poses and velocities [B, K, 13] (3-D) or [B, K, 6] (2-D) of a number of bodies.
+
+    Raises:
+        TypeError, ValueError: for another shape, dtype or device, and on the CPU for numbers that are not finite and
+            quaternions whose length differs from 1 by more than a thousandth.
+    """
+    columns = POSE[grid.dim] + VELOCITY[grid.dim]
+    shape = grid.scenes, count, columns
+    if not isinstance(bodies, Tensor) or bodies.shape != shape:
+        raise ValueError(f"bodies must have shape [B, K, {columns}] = {list(shape)}, got {shape_of(bodies)}")
+    if bodies.dtype not in FLOATING:
+        raise TypeError(f"bodies must be float32 or float64, got {bodies.dtype}")
+    if bodies.device != state.x.device:
+        raise ValueError(f"bodies must be on the device of the state, {state.x.device}, got {bodies.device}")
+    if not is_readable(bodies):
+        return
+    values = bodies.detach()
+    _check_rows(~values.isfinite().all(2), "bodies must be finite, got NaN or infinity")
+    if grid.dim == 3:
+        wrong = (values[..., 3:7].norm(dim=2) - 1).abs() > NOT_UNIT
+        _check_rows(wrong, "bodies must have unit quaternions w, x, y, z in columns 3 to 6, got another length")
 
 
 def motion_of(bodies: Tensor, dim: int) -> Motion:
@@ -295,7 +293,7 @@ def _dim_of(name: str, bodies: Tensor, *velocities: int) -> int:
     return columns[bodies.shape[2]]
 
 
-def _parts_of(k: int, body: Obstacle | Part | Sequence[Obstacle | Part]) -> list[Part]:
+def parts_of(k: int, body: Obstacle | Part | Sequence[Obstacle | Part]) -> list[Part]:
     """The parts of body k."""
     given = list(body) if isinstance(body, Sequence) else [body]
     if not given:
@@ -303,17 +301,37 @@ def _parts_of(k: int, body: Obstacle | Part | Sequence[Obstacle | Part]) -> list
     return [part if isinstance(part, Part) else Part(part) for part in given]
 
 
-def _frames(parts: Sequence[Sequence[Part]], dim: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Numbers of the bodies of O obstacles [O], and positions [O, D] and rotations [O] or [O, 3] in their frames."""
-    flat = [part for own in parts for part in own]
-    zero = 0.0 if dim == 2 else (0.0,) * 3
-    owner = torch.tensor([k for k, own in enumerate(parts) for _ in own], dtype=torch.int64)
-    position = torch.tensor([part.position or (0.0,) * dim for part in flat], dtype=torch.float64)
-    rotation = torch.tensor([zero if part.rotation is None else part.rotation for part in flat], dtype=torch.float64)
-    return owner, position.reshape(-1, dim), rotation.reshape(-1, *(3,) * (dim - 2))
+class Frames(NamedTuple):
+    """Where the O obstacles of bodies are in the frames of these."""
+
+    owner: Tensor  # [O], number of the body
+    position: Tensor  # [O, D] [m]
+    rotation: Tensor  # [O] or [O, 3] [rad]
+
+    @staticmethod
+    def of(parts: Sequence[Sequence[Part]], dim: int) -> Frames:
+        flat = [part for own in parts for part in own]
+        zero = 0.0 if dim == 2 else (0.0,) * 3
+        owner = torch.tensor([k for k, own in enumerate(parts) for _ in own], dtype=torch.int64)
+        position = torch.tensor([part.position or (0.0,) * dim for part in flat], dtype=torch.float64)
+        turn = torch.tensor([zero if part.rotation is None else part.rotation for part in flat], dtype=torch.float64)
+        return Frames(owner, position.reshape(-1, dim), turn.reshape(-1, *(3,) * (dim - 2)))
+
+    def motion(self, of_bodies: Motion) -> Motion:
+        """Motion of the obstacles [B, O, ...] by that of their bodies [B, K, ...]."""
+        device, dim = of_bodies.position.device, self.position.shape[1]
+        owner, position, rotation = (values.to(device, non_blocking=True) for values in self)
+        motion = Motion(*(values[:, owner] for values in of_bodies))
+        arm = (rotation_matrix(motion.rotation, dim) @ position[..., None])[..., 0]
+        return Motion(
+            motion.position + arm,
+            _turned(motion.rotation, rotation.expand_as(motion.rotation)),
+            motion.velocity + swirl(motion.angular_velocity, arm),
+            motion.angular_velocity,
+        )
 
 
-def _assign(obstacles: Sequence[Obstacle], motion: Motion, time: float | Tensor) -> None:
+def assign(obstacles: Sequence[Obstacle], motion: Motion, time: float | Tensor) -> None:
     """Place O obstacles with a motion [B, O, ...] from a time [s], [] or [B]."""
     like = motion.position
     starts = filled([obstacle.start for obstacle in obstacles], like)
@@ -329,7 +347,7 @@ def _assign(obstacles: Sequence[Obstacle], motion: Motion, time: float | Tensor)
         obstacle.place(centre[:, k], rotation[:, k])
 
 
-def _swirl(spin: Tensor, arm: Tensor) -> Tensor:
+def swirl(spin: Tensor, arm: Tensor) -> Tensor:
     """Velocities by rotation, of points away from the position [..., D]."""
     if arm.shape[-1] == 3:
         return torch.linalg.cross(spin, arm)

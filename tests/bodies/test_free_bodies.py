@@ -1,0 +1,269 @@
+"""Rigid bodies that the material pushes: conservation, stability for all ratios of masses, joints, gradients."""
+
+import math
+
+import pytest
+import torch
+
+import torch_mpm as mpm
+from torch_mpm.bodies import Body, Driven, FreeBodies, Hinge, Part, Slider
+
+F64 = torch.float64
+BALL, DENSITY = 0.2, 1000.0
+
+
+def material(dim, device="cpu", dtype=F64, velocity=None, scenes=1, walls=None, gravity=None, E=1e4):
+    """A step, and an elastic block in the middle of a domain."""
+    grid = mpm.Grid(0.1, (0.0,) * dim, (2.0,) * dim, scenes=scenes)
+    step = mpm.Step(grid, mpm.NeoHookean(E=E, nu=0.3), gravity, walls)
+    points = mpm.seed.box((0.6,) * dim, (1.4, 1.0, 1.4)[:dim], grid, per_cell=2**dim)
+    state = mpm.State.at_rest(points, DENSITY, velocity, dtype, device)
+    return step, mpm.State.concatenate([state] * scenes, scene=True) if scenes > 1 else state
+
+
+def ball_of(dim, ratio=1.0, friction=0.5, radius=BALL, **options):
+    """A ball of a density that is `ratio` times that of the material."""
+    volume = math.pi * radius**2 if dim == 2 else 4 / 3 * math.pi * radius**3
+    mass = ratio * DENSITY * volume
+    inertia = (0.5 if dim == 2 else 0.4) * mass * radius**2
+    return Body(mpm.Sphere((0.0,) * dim, radius, friction=friction), mass, inertia, **options)
+
+
+def rows_of(dim, position, velocity, spin=None, device="cpu"):
+    """Rows [1, 1, 6 or 13] without a rotation."""
+    turn = [0.0] if dim == 2 else [1.0, 0.0, 0.0, 0.0]
+    spin = [0.0] * (1 if dim == 2 else 3) if spin is None else spin
+    return torch.tensor([[[*position, *turn, *velocity, *spin]]], dtype=F64, device=device)
+
+
+def momenta(state, body, rows, dim):
+    """Linear and angular momentum about the origin of the material, with that of C, and of one body."""
+    m, x, v = state.mass[:, None].double(), state.x.double(), state.v.double()
+    linear = (m * v).sum(0)
+    # The affine momentum of APIC: Σ m D C with D = dx²/4 (Jiang et al. 2015).
+    affine = 0.1**2 / 4 * (m[:, :, None] * state.C.double()).sum(0)
+    place, own = rows[0, 0, :dim], rows[0, 0, 3 if dim == 2 else 7 :]
+    p = body.mass * own[:dim]
+    if dim == 2:
+        angular = (m[:, 0] * (x[:, 0] * v[:, 1] - x[:, 1] * v[:, 0])).sum() + affine[1, 0] - affine[0, 1]
+        of_body = place[0] * p[1] - place[1] * p[0] + body.inertia[0] * own[2]
+    else:
+        axial = torch.stack([affine[2, 1] - affine[1, 2], affine[0, 2] - affine[2, 0], affine[1, 0] - affine[0, 1]])
+        angular = torch.linalg.cross(x, m * v).sum(0) + axial
+        of_body = torch.linalg.cross(place, p) + body.inertia[0] * own[3:]
+    return torch.cat([linear + p, (angular + of_body).reshape(-1)])
+
+
+@pytest.mark.parametrize("ratio", [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize("kind", ["separate", "slip", "sticky"])
+def test_momentum_is_conserved(dim, device, kind, ratio):
+    """Linear and angular momentum of material and body, to rounding, also where the solve would not converge."""
+    step, state = material(dim, device, velocity=(0.3, 0.5, -0.2)[:dim])
+    body = ball_of(dim, ratio)
+    body.parts[0].obstacle.kind = kind
+    bodies = FreeBodies(step, [body])
+    rows = rows_of(dim, (1.05, 1.22, 0.95)[:dim], (0.2, -1.0, 0.1)[:dim], device=device)
+    state = step.prepare(state)
+    before = momenta(state.replace(C=torch.zeros_like(state.x)[:, :, None].repeat(1, 1, dim)), body, rows, dim)
+    speed = float(rows[0, 0, -1].abs())
+    with torch.no_grad():
+        state, rows = bodies.advance(state, rows, 12, 2e-3)
+    bodies.check()
+    after = momenta(state, body, rows, dim)
+    assert float((rows[0, 0, 3 if dim == 2 else 7 :]).abs().max()) != speed  # they have met
+    scale = float(state.mass.sum()) + body.mass
+    torch.testing.assert_close(after, before, rtol=0, atol=1e-12 * scale)
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.5, 2.0])
+@pytest.mark.parametrize("ratio", [1e-3, 1e-2, 1.0, 1e2])
+def test_bodies_of_any_mass_are_stable_at_the_time_step_of_the_material(device, ratio, friction):
+    """A light disc is not thrown away by what it lies on, and a heavy one does not stop at once: energy never grows."""
+    step, state = material(2, device, walls="slip", E=1e4 * max(1.0, ratio))
+    bodies = FreeBodies(step, [ball_of(2, ratio, friction)])
+    rows = rows_of(2, (1.0, 1.19), (0.3, -1.0), device=device)
+    dt = float(step.stable_dt(state, 0.9))
+    mass, inertia = bodies.bodies[0].mass, bodies.bodies[0].inertia[0]
+
+    def energy(state, rows):
+        own = rows[0, 0, 3:]
+        kinetic = 0.5 * mass * float(own[:2].square().sum()) + 0.5 * inertia * float(own[2] ** 2)
+        elastic = float((step.diagnostics(state).energy * state.volume).sum())
+        return kinetic + 0.5 * float((state.mass * state.v.square().sum(1)).sum()) + elastic
+
+    first = energy(state, rows)
+    for _ in range(8):
+        with torch.no_grad():
+            state, rows = bodies.advance(state, rows, 10, dt)
+        bodies.check()
+        assert bodies.report.iterations <= 8
+        assert energy(state, rows) < 1.02 * first
+    step.check(state)
+
+
+def test_a_body_without_contact_flies_freely(device):
+    """Three unequal moments of inertia: the angular momentum stays, the spin does not; gravity of the step acts."""
+    step, state = material(3, device, gravity=(0.0, -9.8, 0.0))
+    body = Body(mpm.Sphere((0.0,) * 3, 0.05), 2.0, (1.0, 2.0, 3.0))
+    bodies = FreeBodies(step, [body])
+    rows = rows_of(3, (0.2, 1.8, 0.2), (0.1, 0.0, 0.0), (1.0, 2.0, 0.5), device=device)
+    with torch.no_grad():
+        _, end = bodies.advance(state, rows, 40, 5e-3)
+    turn = mpm.bodies.free_bodies.rotation_matrix(mpm.bodies.exchange.motion_of(end, 3).rotation, 3)
+    momentum = (body.mass_matrix(turn[:, 0])[0, 3:, 3:] @ end[0, 0, 10:]).cpu()
+    torch.testing.assert_close(momentum, torch.tensor([1.0, 4.0, 1.5], dtype=F64), rtol=1e-12, atol=0)
+    assert float((end[0, 0, 10:] - rows[0, 0, 10:]).norm()) > 0.1
+    torch.testing.assert_close(end[0, 0, 8].cpu(), torch.tensor(-9.8 * 0.2, dtype=F64), rtol=1e-12, atol=0)
+    # Symplectic Euler: −g dt² n (n + 1)/2.
+    torch.testing.assert_close(end[0, 0, 1].cpu(), torch.tensor(1.8 - 9.8 * 5e-3**2 * 820, dtype=F64))
+
+
+def test_a_driven_body_is_an_obstacle_that_moves(dim, device):
+    """As an obstacle with that velocity in a step by step rollout, bit for bit."""
+    velocity = (0.1, -1.0, 0.05)[:dim]
+    step, state = material(dim, device)
+    bodies = FreeBodies(step, [ball_of(dim, joint=Driven())])
+    at = (1.02, 1.2, 0.97)[:dim]
+    with torch.no_grad():
+        end, rows = bodies.advance(state, rows_of(dim, at, velocity, device=device), 5, 2e-3)
+        other, _ = material(dim, device)
+        other.boundaries.append(mpm.Sphere(at, BALL, friction=0.5, velocity=velocity))
+        for _ in range(5):
+            state = other(state, 2e-3)
+    torch.testing.assert_close(end.v, state.v, rtol=1e-11, atol=1e-12)
+    torch.testing.assert_close(rows[0, 0, :dim].cpu(), torch.tensor(at, dtype=F64) + 0.01 * torch.tensor(velocity))
+    assert float(end.v.abs().max()) > 0.1
+
+
+def test_a_hinge_keeps_its_distance_and_takes_the_moment(device):
+    """A pendulum of a disc: the anchor stays where it is; in gravity alone its energy stays to the order of dt."""
+    step, state = material(2, device, gravity=(0.0, -9.8))
+    anchor, length = (0.3, 1.6), 0.3
+    bodies = FreeBodies(step, [ball_of(2, radius=0.05, joint=Hinge(anchor))])
+    rows = rows_of(2, (anchor[0] + length, anchor[1]), (0.0, 0.0), device=device)
+    with torch.no_grad():
+        _, end = bodies.advance(state, rows, 400, 5e-4)
+    x, v, spin = end[0, 0, :2].cpu(), end[0, 0, 3:5].cpu(), float(end[0, 0, 5])
+    arm = x - torch.tensor(anchor, dtype=F64)
+    assert abs(float(arm.norm()) - length) < 1e-12
+    torch.testing.assert_close(v, spin * torch.stack([-arm[1], arm[0]]), rtol=1e-12, atol=1e-12)
+    body = bodies.bodies[0]
+    kinetic = 0.5 * body.mass * float(v @ v) + 0.5 * body.inertia[0] * spin**2
+    lost = body.mass * 9.8 * (anchor[1] - float(x[1]))
+    assert lost > 0.1 * body.mass * 9.8 * length
+    assert abs(kinetic - lost) < 0.01 * lost
+
+
+def test_a_slider_moves_along_its_axis_alone(dim, device):
+    step, state = material(dim, device)
+    way = (0.6, -0.8, 0.0)[:dim]
+    bodies = FreeBodies(step, [ball_of(dim, joint=Slider(way))])
+    at = (1.0, 1.2, 1.0)[:dim]
+    with torch.no_grad():
+        _, rows = bodies.advance(state, rows_of(dim, at, way, device=device), 10, 2e-3)
+    moved = rows[0, 0, :dim].cpu() - torch.tensor(at, dtype=F64)
+    along = torch.tensor(way, dtype=F64)
+    assert 0 < float(moved @ along) < 0.0199  # it was slowed
+    torch.testing.assert_close(moved, (moved @ along) * along, rtol=1e-12, atol=1e-14)
+    assert float(rows[0, 0, -1]) == 0
+
+
+def test_scenes_of_a_batch_are_independent(device):
+    """Bodies of a batch in float64 are those of each scene alone."""
+    step, state = material(2, device, scenes=3)
+    speeds = (-1.0, -0.5, 0.4)
+    rows = torch.cat([rows_of(2, (1.0, 1.2), (0.1, speed), device=device) for speed in speeds])
+    with torch.no_grad():
+        _, together = FreeBodies(step, [ball_of(2)]).advance(state, rows, 6, 2e-3)
+        alone, one = material(2, device)
+        for k in range(3):
+            _, end = FreeBodies(alone, [ball_of(2)]).advance(one, rows[k : k + 1], 6, 2e-3)
+            torch.testing.assert_close(together[k], end[0], rtol=1e-12, atol=1e-13)
+
+
+def test_parts_of_a_body_and_two_bodies(device):
+    """A dumbbell of two discs is pushed as one body; a second body elsewhere is left alone."""
+    step, state = material(2, device)
+    discs = [Part(mpm.Sphere((0, 0), 0.15, friction=0.3), (side, 0.0)) for side in (-0.2, 0.2)]
+    dumbbell = Body(discs, 50.0, 4.0)
+    bodies = FreeBodies(step, [dumbbell, ball_of(2, radius=0.1)])
+    rows = torch.cat([rows_of(2, (1.4, 1.13), (0.0, -1.0)), rows_of(2, (0.3, 0.3), (0.5, 0.0))], 1).to(device)
+    with torch.no_grad():
+        state, end = bodies.advance(step.prepare(state), rows, 10, 2e-3)
+    assert float(end[0, 0, 5]) < -0.1  # only its left disc is above the block
+    torch.testing.assert_close(end[0, 1, 3:], rows[0, 1, 3:], rtol=1e-14, atol=0)
+    linear = (state.mass[:, None] * state.v).sum(0) + 50.0 * end[0, 0, 3:5]
+    torch.testing.assert_close(linear, 50.0 * rows[0, 0, 3:5], rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("joint", [None, Slider((0.3, -1.0))], ids=["free", "slider"])
+def test_gradients_equal_differences(device, joint):
+    """By pose and velocity of the body, its friction, the modulus and the velocity of the material."""
+    step, state = material(2, device)
+    E = torch.tensor(1e4, dtype=F64, device=device, requires_grad=True)
+    friction = torch.tensor(0.2, dtype=F64, device=device, requires_grad=True)
+    rows = rows_of(2, (1.03, 1.19), (0.3, -0.9), device=device).requires_grad_()
+    speed = torch.tensor([0.1, 0.2], dtype=F64, device=device, requires_grad=True)
+    inputs = [rows, friction, E, speed]
+
+    def loss(rows, friction, E, speed):
+        own = mpm.Step(step.grid, mpm.NeoHookean(E=E, nu=0.3))
+        body = ball_of(2, joint=joint)
+        body.parts[0].obstacle.friction = friction
+        bodies = FreeBodies(own, [body])
+        end, after = bodies.advance(state.replace(v=state.v + speed), rows, 8, 2e-3)
+        weights = torch.tensor([1.0, -2.0, 0.5, 0.3, 0.2, 0.1], dtype=F64, device=device)
+        return (after * weights).sum() + (end.v.square() * state.mass[:, None]).sum() + end.x[:, 1].sum()
+
+    grads = torch.autograd.grad(loss(*inputs), inputs)
+    generator = torch.Generator().manual_seed(0)
+    for k, (value, grad) in enumerate(zip(inputs, grads, strict=True)):
+        way = torch.randn(value.shape, generator=generator, dtype=F64).to(device)
+        h = 1e-6 * max(1.0, float(value.detach().abs().max()))
+        with torch.no_grad():
+            sides = [loss(*[v + s * h * way if i == k else v for i, v in enumerate(inputs)]) for s in (1, -1)]
+        difference = float(sides[0] - sides[1]) / (2 * h)
+        assert float((grad * way).sum()) == pytest.approx(difference, rel=1e-6, abs=1e-8), k
+
+
+@pytest.mark.parametrize(
+    ("make", "error"),
+    [
+        (lambda step: FreeBodies(step, []), "bodies must be a list of Body"),
+        (lambda step: FreeBodies(step, [mpm.Sphere((0, 0), 0.1)]), "bodies must be a list of Body"),
+        (lambda step: Body(mpm.Sphere((0, 0), 0.1), 0.0, 1.0), "mass must be positive"),
+        (lambda step: Body(mpm.Sphere((0, 0), 0.1), 1.0, -1.0), "inertia must be positive"),
+        (
+            lambda step: FreeBodies(step, [Body(mpm.Sphere((0, 0), 0.1), 1.0, (1.0, 1.0, 1.0))]),
+            "inertia must be a number",
+        ),
+        (lambda step: FreeBodies(step, [ball_of(2, joint=Hinge((0, 0, 0), (0, 0, 1)))]), "anchor of 2 numbers"),
+        (lambda step: FreeBodies(step, [ball_of(2), _of_a_boundary(step)]), "no boundaries of the step"),
+        (lambda step: FreeBodies(step, [Body(mpm.Sphere((0, 0), 0.1, end=1.0), 1.0, 1.0)]), "at all times"),
+        (lambda step: FreeBodies(step, [Body(mpm.SDF(lambda x: x[:, 0], (0, 0)), 1.0, 1.0)]), "Sampled.of"),
+        (lambda step: Slider((0.0, 0.0)), "positive length"),
+    ],
+)
+def test_wrong_arguments(make, error):
+    step, _ = material(2)
+    with pytest.raises((TypeError, ValueError), match=error):
+        make(step)
+
+
+def _of_a_boundary(step):
+    """A body whose obstacle is a boundary of the step."""
+    ball = mpm.Sphere((0, 0), 0.1)
+    step.boundaries.append(ball)
+    return Body(ball, 1.0, 1.0)
+
+
+def test_steps_that_do_not_fit():
+    step, state = material(2)
+    bodies = FreeBodies(step, [ball_of(2)])
+    with pytest.raises(ValueError, match="bodies must have shape"):
+        bodies.advance(state, torch.zeros(1, 2, 6), 1, 1e-3)
+    with pytest.raises(ValueError, match="n must be"):
+        bodies.advance(state, torch.zeros(1, 1, 6), 0, 1e-3)
+    step.on_grid = lambda blocks, velocity, mass, dt: velocity
+    with pytest.raises(ValueError, match="on_grid"):
+        bodies.advance(state, torch.zeros(1, 1, 6), 1, 1e-3)

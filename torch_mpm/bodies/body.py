@@ -1,0 +1,149 @@
+"""Rigid bodies with mass and inertia, and the joints that guide them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from ..boundaries.obstacles import Obstacle
+from ..errors import check_number, check_vector, shape_of
+from .exchange import Part, parts_of, swirl
+
+
+class Joint:
+    """Motion that a body is free to have. This one allows all of it."""
+
+    def directions(self, position: Tensor) -> Tensor | None:
+        """Velocities and angular velocities [B, n, f] that the body at a position [B, D] may have; None for all."""
+        return None
+
+    def arm(self, position: Tensor) -> Tensor | None:
+        """Way from the fixed point to the position [B, D] [m]; None without such a point."""
+        return None
+
+    def check_dimension(self, dim: int) -> None:
+        """Raise ValueError for a joint of another dimension than D."""
+
+
+class Hinge(Joint):
+    """Rotation about an axis that is fixed in the world.
+
+    Args:
+        anchor: a point of the axis [m], D numbers.
+        axis: its direction, 3 numbers of any length but zero; None in 2-D.
+    """
+
+    def __init__(self, anchor: Sequence[float], axis: Sequence[float] | None = None) -> None:
+        self.anchor = check_vector("anchor", anchor)
+        self.axis = None if axis is None else _unit("axis", axis)
+
+    def check_dimension(self, dim: int) -> None:
+        if len(self.anchor) != dim or (self.axis is None) != (dim == 2) or (self.axis and len(self.axis) != dim):
+            raise ValueError(f"hinge must have an anchor of {dim} numbers and, in 3-D alone, an axis of 3")
+
+    def arm(self, position: Tensor) -> Tensor | None:
+        return position - position.new_tensor(self.anchor)
+
+    def directions(self, position: Tensor) -> Tensor | None:
+        arm = position - position.new_tensor(self.anchor)
+        spin = arm.new_tensor([1.0] if self.axis is None else self.axis).expand(len(arm), -1)
+        velocity = swirl(spin[:, 0] if self.axis is None else spin, arm)
+        return torch.cat([velocity, spin], 1)[..., None]
+
+
+class Slider(Joint):
+    """Translation along a direction, without rotation.
+
+    Args:
+        axis: the direction, D numbers of any length but zero.
+    """
+
+    def __init__(self, axis: Sequence[float]) -> None:
+        self.axis = _unit("axis", axis)
+
+    def check_dimension(self, dim: int) -> None:
+        if len(self.axis) != dim:
+            raise ValueError(f"slider must have an axis of {dim} numbers, got {self.axis}")
+
+    def directions(self, position: Tensor) -> Tensor | None:
+        way = [*self.axis, *[0.0] * (1 if len(self.axis) == 2 else 3)]
+        return position.new_tensor(way).expand(len(position), -1)[..., None]
+
+
+class Driven(Joint):
+    """No motion but the velocity that the body is given: nothing pushes it."""
+
+    def directions(self, position: Tensor) -> Tensor | None:
+        dim = position.shape[1]
+        return position.new_zeros(len(position), dim + (1 if dim == 2 else 3), 0)
+
+
+class Body:
+    """A rigid body, whose frame has its centre of mass as origin.
+
+    Args:
+        parts: an obstacle, a `Part`, or a list of these; shapes that the kernel of contact knows.
+        mass: [kg], positive.
+        inertia: moment of inertia about the centre of mass [kg m²], positive: a number in 2-D; in 3-D a number, or
+            three for the axes of the frame.
+        joint: `Hinge`, `Slider` or `Driven`; None for a free body.
+
+    Raises:
+        TypeError, ValueError: for anything else.
+    """
+
+    def __init__(
+        self,
+        parts: Obstacle | Part | Sequence[Obstacle | Part],
+        mass: float,
+        inertia: float | Sequence[float],
+        joint: Joint | None = None,
+    ) -> None:
+        self.parts = parts_of(0, parts)
+        self.mass = float(check_number("mass", mass, "positive and finite", lambda v: 0 < v < math.inf))
+        numbers = inertia if isinstance(inertia, Sequence) else [inertia]
+        self.inertia = tuple(
+            float(check_number("inertia", one, "positive and finite", lambda v: 0 < v < math.inf)) for one in numbers
+        )
+        if joint is not None and not isinstance(joint, Joint):
+            raise TypeError(f"joint must be a Hinge, a Slider, Driven or None, got {shape_of(joint)}")
+        self.joint = joint or Joint()
+
+    def check_dimension(self, dim: int) -> None:
+        """Raise ValueError for a body of another dimension than D."""
+        if len(self.inertia) not in ((1,) if dim == 2 else (1, 3)):
+            raise ValueError(
+                f"inertia must be {'a number in 2-D' if dim == 2 else 'one or three numbers'}, got {self.inertia}"
+            )
+        self.joint.check_dimension(dim)
+        for part in self.parts:
+            part.check_dimension(dim)
+
+    def mass_matrix(self, turn: Tensor) -> Tensor:
+        """Mass and inertia [B, n, n] by the rotation of the frame [B, D, D], n = 3 in 2-D and 6 in 3-D."""
+        count, dim = turn.shape[:2]
+        matrix = turn.new_zeros(count, *(dim + (1 if dim == 2 else 3),) * 2)
+        matrix[:, range(dim), range(dim)] = self.mass
+        if dim == 2:
+            matrix[:, 2, 2] = self.inertia[0]
+        else:
+            matrix[:, 3:, 3:] = turn @ torch.diag(turn.new_tensor(self.inertia).expand(3)) @ turn.mT
+        return matrix
+
+
+def mobility(matrix: Tensor, directions: Tensor | None) -> Tensor:
+    """Velocities by impulses [B, n, n]: S (Sᵀ M S)⁻¹ Sᵀ for the mass matrix M and the directions S."""
+    if directions is None:
+        return torch.linalg.inv(matrix)
+    return directions @ torch.linalg.solve(directions.mT @ matrix @ directions, directions.mT)
+
+
+def _unit(name: str, vector: Sequence[float]) -> tuple[float, ...]:
+    numbers = check_vector(name, vector)
+    length = math.hypot(*numbers)
+    if not 0 < length < math.inf:
+        raise ValueError(f"{name} must have a positive length, got {numbers}")
+    return tuple(n / length for n in numbers)
