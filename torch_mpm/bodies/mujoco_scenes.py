@@ -13,7 +13,11 @@ from .geoms import load_mujoco
 from .mujoco_threads import MujocoThreads
 
 LEAST_DOFS = 1000
-"""Least number of degrees of freedom of all scenes that is computed by threads."""
+"""Least number of degrees of freedom of all scenes that is computed by threads.
+
+With two threads and fewer, starting them and copying states take what they gain, or more
+(benchmarks/results/coupling_amd_epyc.md).
+"""
 
 
 class MujocoScenes:
@@ -23,8 +27,8 @@ class MujocoScenes:
         model: MjModel.
         data: MjData of the scenes; a list, whose items are read in each `begin`.
         bodies: numbers of the bodies.
-        threads: number of threads; None for those of torch where the scenes have at least `LEAST_DOFS` degrees of
-            freedom, and MuJoCo has threads for the model.
+        threads: largest number of threads; None for those of torch where the scenes have at least `LEAST_DOFS` degrees
+            of freedom, and MuJoCo has threads for the model.
 
     Raises:
         ImportError, ValueError: for more than one thread where MuJoCo has none; see `MujocoThreads`.
@@ -35,8 +39,9 @@ class MujocoScenes:
         self.model, self.data = model, data
         self._bodies = np.array(bodies, dtype=np.int64)
         self._required = threads is not None
-        enough = len(data) * model.nv >= LEAST_DOFS
-        self._wanted = threads if threads is not None else torch.get_num_threads() if enough else 1
+        if threads is None:
+            threads = torch.get_num_threads() if len(data) * model.nv >= LEAST_DOFS else 1
+        self._wanted = min(threads, len(data))
         self._threads: MujocoThreads | None = None
         kinds = self._mujoco.mjtWarning
         self._unstable = [int(w) for w in (kinds.mjWARN_BADQPOS, kinds.mjWARN_BADQVEL, kinds.mjWARN_BADQACC)]
