@@ -66,7 +66,7 @@ def couple(
             in it, as bodies need that are lighter than the material that they move.
         data: MjData, or a list of one for each scene of the grid; None for new ones.
         threads: number of threads that compute the steps of MuJoCo, each with a part of the scenes; 1 for the calling
-            thread. None for those of torch where the scenes have at least 1000 degrees of freedom and MuJoCo has
+            thread. None for those of torch where the scenes have at least 500 degrees of freedom and MuJoCo has
             threads for the model. The last solution of each `advance` is always that of the calling thread, which
             computes contacts and sensors in `data` too. Results do not depend on the number, bit by bit.
 

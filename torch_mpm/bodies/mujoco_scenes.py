@@ -12,11 +12,11 @@ from ..errors import SimulationError
 from .geoms import load_mujoco
 from .mujoco_threads import MujocoThreads
 
-LEAST_DOFS = 1000
+LEAST_DOFS = 500
 """Least number of degrees of freedom of all scenes that is computed by threads.
 
-With two threads and fewer, starting them and copying states take what they gain, or more
-(benchmarks/results/coupling_amd_epyc.md).
+Two threads gain from about this number on. With fewer, their start and the copies of states take longer
+(benchmarks/results/coupling_amd_epyc.md, "Steps of MuJoCo").
 """
 
 
