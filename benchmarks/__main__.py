@@ -25,6 +25,7 @@ PROGRAMS = (
     "benchmarks.speed.checkpoints",
     "benchmarks.speed.training",
     "benchmarks.speed.splats",
+    "benchmarks.speed.coupling",
     "benchmarks.implicit",
     "benchmarks.datasets",
     "benchmarks.accuracy.precision",

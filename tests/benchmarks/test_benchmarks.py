@@ -44,6 +44,19 @@ def test_splats_program_times_runs_with_files(tmp_path: Path) -> None:
     assert len(set(names)) == len(names) == len(splats.PARTS) + 2
 
 
+@pytest.mark.thorough
+def test_coupling_program_divides_the_time_of_a_step(tmp_path: Path) -> None:
+    pytest.importorskip("mujoco.batch")
+    run_quick_here("benchmarks.speed.coupling", tmp_path)
+    found = result(tmp_path, "coupling_*.json")
+    for run in found["coupled"]:
+        parts = [run["ms"][part] for part in ("MuJoCo", "exchange", "material")]
+        assert min(parts) > 0 and sum(parts) == pytest.approx(run["ms"]["total"])
+        assert run["particles"] == 160 * run["scenes"]
+    assert {run["scenes"] for run in found["coupled"]} == {1, 4}
+    assert all(min(run["us"].values()) > 0 for run in found["steps"])
+
+
 def test_failed_part_is_reported_and_the_others_go_on(monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*_: object) -> None:
         raise RuntimeError("no such device")

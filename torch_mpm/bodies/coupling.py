@@ -26,6 +26,7 @@ from ..step.step import Step
 from .exchange import RigidBodies, with_velocities
 from .fixed_point import FixedPoint
 from .geoms import body_number, colliding_geoms, geom_name, load_mujoco, part_of_geom
+from .mujoco_scenes import MujocoScenes
 
 SAMPLES_PER_CELL = 2
 """Samples of a mesh per cell of the grid along each axis."""
@@ -44,6 +45,7 @@ def couple(
     substeps: int | None = None,
     exchanges: int = 1,
     data: Any = None,
+    threads: int | None = None,
 ) -> MujocoCoupling:
     """Couple bodies of a MuJoCo model with the material of a step.
 
@@ -63,17 +65,21 @@ def couple(
             With more, both sides are solved several times from the same states, so that the wrench of a step acts
             in it, as bodies need that are lighter than the material that they move.
         data: MjData, or a list of one for each scene of the grid; None for new ones.
+        threads: number of threads that compute the steps of MuJoCo, each with a part of the scenes; 1 for the calling
+            thread. None for those of torch where the scenes have at least 500 degrees of freedom and MuJoCo has
+            threads for the model. The last solution of each `advance` is always that of the calling thread, which
+            computes contacts and sensors in `data` too. Results do not depend on the number, bit by bit.
 
     Returns:
         The coupling, whose `advance` takes the place of `mj_step` and `rollout`. As after a rollout, `step.check`
         reports particles that left the grid.
 
     Raises:
-        ImportError: without mujoco.
+        ImportError: without mujoco, and for threads without `mujoco.batch`, which version 3.17 has.
         TypeError, ValueError: for a wrong argument, an unknown body or geom, a geom of another type, a body without an
-            obstacle.
+            obstacle; for threads where MuJoCo has none: models with plugins or sleeping bodies, and Python callbacks.
     """
-    return MujocoCoupling(model, step, bodies, geoms, kind, friction, substeps, exchanges, data)
+    return MujocoCoupling(model, step, bodies, geoms, kind, friction, substeps, exchanges, data, threads)
 
 
 class MujocoCoupling:
@@ -100,6 +106,7 @@ class MujocoCoupling:
         substeps: int | None,
         exchanges: int,
         data: Any,
+        threads: int | None,
     ) -> None:
         self._mujoco = load_mujoco()
         _check_model_and_step(self._mujoco, model, step)
@@ -110,10 +117,12 @@ class MujocoCoupling:
             raise ValueError(f"bodies must be different, got {list(bodies)}")
         self.substeps = None if substeps is None else check_count("substeps", substeps, 1)
         self.exchanges = check_count("exchanges", exchanges, 1)
+        threads = None if threads is None else check_count("threads", threads, 1)
         self.model, self.step = model, step
         self.data = _data_of(self._mujoco, model, data, step.grid.scenes)
-        self._numbers = [body_number(model, name) for name in bodies]
-        chosen = _chosen_geoms(model, self._numbers, geoms)
+        numbers = [body_number(model, name) for name in bodies]
+        self._scenes = MujocoScenes(model, self.data, numbers, threads)
+        chosen = _chosen_geoms(model, numbers, geoms)
         spacing = step.grid.dx / SAMPLES_PER_CELL
         parts = [[part_of_geom(model, g, kind, friction, spacing) for g in own] for own in chosen]
         self.obstacles = {
@@ -123,11 +132,11 @@ class MujocoCoupling:
         }
         step.boundaries.extend(self.obstacles.values())
         self.bodies = RigidBodies(step, parts)
-        self._scale = _scales(model, self._numbers)
+        self._scale = _scales(model, numbers)
         self._unscale = torch.where(self._scale > 0, 1 / self._scale, 0.0)
-        shape = len(self.data), len(self._numbers), 6
+        shape = len(self.data), len(numbers), 6
         self.pending, self._found, self.wrenches = (torch.zeros(shape, dtype=torch.float64) for _ in range(3))
-        self._fixed_point = FixedPoint(len(self.data), 6 * len(self._numbers))
+        self._fixed_point = FixedPoint(len(self.data), 6 * len(numbers))
 
     def advance(self, state: State, n: int = 1, *, seconds: float | None = None) -> State:
         """The state n steps of MuJoCo later; the data are advanced too.
@@ -149,9 +158,10 @@ class MujocoCoupling:
         if state.impulse is None:
             state = self.step.with_impulses(state)
         substeps = self._substeps(state)
+        self._scenes.begin()
         poses = self._poses()
-        for _ in range(n):
-            state, poses = self._solve(state, poses, substeps)
+        for k in range(n):
+            state, poses = self._solve(state, poses, substeps, last=k == n - 1)
         return state
 
     def reset(self, scenes: Sequence[int] | None = None) -> None:
@@ -168,20 +178,21 @@ class MujocoCoupling:
 
     # ---- one step of MuJoCo
 
-    def _solve(self, state: State, begin: Tensor, substeps: int) -> tuple[State, Tensor]:
-        """The state and the poses [B, K, 7] one step of MuJoCo later.
+    def _solve(self, state: State, begin: Tensor, substeps: int, last: bool) -> tuple[State, Tensor]:
+        """The state and the poses [B, K, 7] one step of MuJoCo later, which is the last one of `advance` or not.
 
         Impulses here are [B, K, 6], with moments about the centres of mass at the beginning, where wrenches act.
         """
         pending = _moved(self.pending, begin, -1)
         applied = pending if self.exchanges == 1 else pending + self._found
-        saved = None if self.exchanges == 1 else [self._saved(data) for data in self.data]
+        saved = None if self.exchanges == 1 else self._scenes.states()
         self._fixed_point.begin()
         for k in range(self.exchanges):
             if saved is not None and k > 0:
-                self._restore(saved)
+                self._scenes.restore(saved)
                 applied = applied + self._fixed_point.correction().reshape(applied.shape) * self._unscale
-            self._step_bodies(applied)
+            wrenches = (applied / self.model.opt.timestep).numpy()
+            self._scenes.step(wrenches, derived=last and k == self.exchanges - 1)
             end = self._poses()
             after = self._step_material(state, begin, end, substeps)
             found = self.bodies.impulses(state, after, begin.to(state.x.device)).cpu()
@@ -192,17 +203,6 @@ class MujocoCoupling:
         self.wrenches = found / self.model.opt.timestep
         return after, end
 
-    def _step_bodies(self, impulses: Tensor) -> None:
-        wrenches = (impulses / self.model.opt.timestep).numpy()
-        for data, wrench in zip(self.data, wrenches, strict=True):
-            data.xfrc_applied[self._numbers] = wrench
-            before = self._warnings(data), data.time
-            self._mujoco.mj_step(self.model, data)
-            if (self._warnings(data), data.time) != (before[0], before[1] + self.model.opt.timestep):
-                raise SimulationError(
-                    f"MuJoCo reports unstable data at {before[1]:.6g} s: use a smaller time step, or more exchanges"
-                )
-
     def _step_material(self, state: State, begin: Tensor, end: Tensor, substeps: int) -> State:
         seconds = self.model.opt.timestep
         self.bodies.move(with_velocities(begin, end, seconds).to(state.x.device), state)
@@ -210,25 +210,7 @@ class MujocoCoupling:
 
     def _poses(self) -> Tensor:
         """Centres of mass and orientations of the bodies by the present data [B, K, 7]."""
-        rows = []
-        for data in self.data:
-            self._mujoco.mj_kinematics(self.model, data)
-            rows.append(np.concatenate([data.xipos[self._numbers], data.xquat[self._numbers]], 1))
-        return torch.from_numpy(np.stack(rows))
-
-    def _warnings(self, data: Any) -> list[int]:
-        kinds = self._mujoco.mjtWarning
-        return [data.warning[w].number for w in (kinds.mjWARN_BADQPOS, kinds.mjWARN_BADQVEL, kinds.mjWARN_BADQACC)]
-
-    def _saved(self, data: Any) -> np.ndarray:
-        kind = self._mujoco.mjtState.mjSTATE_INTEGRATION
-        values = np.empty(self._mujoco.mj_stateSize(self.model, kind))
-        self._mujoco.mj_getState(self.model, data, values, kind)
-        return values
-
-    def _restore(self, saved: Sequence[np.ndarray]) -> None:
-        for data, values in zip(self.data, saved, strict=True):
-            self._mujoco.mj_setState(self.model, data, values, self._mujoco.mjtState.mjSTATE_INTEGRATION)
+        return torch.from_numpy(self._scenes.poses())
 
     # ---- settings
 
