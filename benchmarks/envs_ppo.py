@@ -36,7 +36,7 @@ def measure(names: Sequence[str], quick: bool) -> dict[str, Any]:
     for name in names:
         training = learn.TRAININGS[name]
         if quick:
-            training = training._replace(steps=160, scenes=2, steps_per_update=40)
+            training = training._replace(steps=240, scenes=2, steps_per_update=40)
         begin = time.perf_counter()
         trained = learn.train(name, training)
         seconds = time.perf_counter() - begin

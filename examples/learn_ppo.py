@@ -40,7 +40,7 @@ TRAININGS = {
     "pour": Training(80_000),
     "scoop": Training(20_000, epochs=20),
     "lift": Training(30_000),
-    "write": Training(6_400, 8, epochs=20),
+    "write": Training(4_800, 8, epochs=20),
 }
 DISCOUNT = 0.98
 TEST = 10**6  # seed of the first scene of the test
@@ -125,16 +125,28 @@ def episode(env: envs.MaterialEnv, policy: nn.Module, seed: int) -> Episode:
 
 
 class Curve(BaseCallback):
-    """Mean return of the episodes that ended since the update before, at each update where one has, and failures."""
+    """Mean return of the episodes that ended since the update before, at each update where one has, and failures.
+
+    The first episodes of the scenes end early, one after another, so that later an update has steps from all times of
+    an episode. They do not count.
+    """
 
     def __init__(self) -> None:
         super().__init__()
         self.points: list[tuple[int, float]] = []
         self.failed = 0
         self._ended: list[float] = []
+        self._scenes: set[int] = set()  # whose first episode has ended
+
+    def _on_training_start(self) -> None:
+        env = self.training_env.unwrapped.env
+        b = torch.arange(env.num_envs, device=env.device)
+        env.steps = env.steps + b * env.max_episode_steps // env.num_envs
 
     def _on_step(self) -> bool:
-        self._ended += [float(info["episode"]["r"]) for info in self.locals["infos"] if "episode" in info]
+        ended = {b: info["episode"]["r"] for b, info in enumerate(self.locals["infos"]) if "episode" in info}
+        self._ended += [float(value) for b, value in ended.items() if b in self._scenes]
+        self._scenes.update(ended)
         self.failed += sum("reason" in info for info in self.locals["infos"])
         return True
 
