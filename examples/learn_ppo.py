@@ -35,9 +35,9 @@ class Training(NamedTuple):
 
 
 TRAININGS = {
-    "push": Training(20_000),
+    "push": Training(40_000),
     "roll": Training(30_000),
-    "pour": Training(80_000),
+    "pour": Training(60_000),
     "scoop": Training(20_000, epochs=20),
     "lift": Training(30_000),
     "write": Training(4_800, 8, epochs=20),
