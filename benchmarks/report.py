@@ -1,8 +1,9 @@
 """The tables and figures of the documents, from the result files: `python -m benchmarks.report [--write]`.
 
 Prints the tables. With --write, inserts them between the lines `<!-- benchmarks -->` and `<!-- /benchmarks -->` of
-docs/measured.md (all tables), README.md (one of speed and one of accuracy), docs/implicit.md and the pages for users of
-other projects, and draws the figures of several devices beside the results. Each program draws its other figures.
+docs/measured.md (all tables), README.md (one of speed and one of accuracy), docs/implicit.md, docs/envs.md and the
+pages for users of other projects, and draws the figures of several devices beside the results. Each program draws its
+other figures.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from . import common
+from . import common, envs_ppo
 from .accuracy.limits import tables as limit_tables
 from .accuracy.runout import PUBLISHED, published, slopes
 from .speed import doors, network_steps, roofline, scaling, thermal
@@ -28,6 +29,7 @@ from .stability.heat_step import table as heat_step_table
 
 README, MEASURED = common.ROOT / "README.md", common.ROOT / "docs" / "measured.md"
 IMPLICIT = common.ROOT / "docs" / "implicit.md"
+ENVS = common.ROOT / "docs" / "envs.md"
 MIGRATING = common.ROOT / "docs" / "migrating"
 BEGIN, END = "<!-- benchmarks -->", "<!-- /benchmarks -->"
 FORWARD = ("step", "step, CUDA graph")
@@ -176,6 +178,20 @@ def migrating(directory: Path) -> dict[Path, str]:
     pages = {f"{page}.md": [peers_of_training(results, [project]), notes] for page, project in
              (("mpm_pytorch", "MPM-PyTorch"), ("nclaw", "NCLaw"), ("physgaussian", "PhysGaussian"))}  # fmt: skip
     return {MIGRATING / name: "\n\n".join(parts) for name, parts in pages.items()}
+
+
+def learning(results: list[dict[str, Any]]) -> str:
+    """Returns of the tasks of `torch_mpm.envs` by PPO."""
+    intro = (
+        "A training of each task from seed 0, with the defaults of the example (benchmarks/envs_ppo.py).\n"
+        "The return is the sum of the rewards of an episode: in m, but for `write`, where 1 is all of the clay in the "
+        "groove.\n"
+        "Columns of the test are means over scenes that the training has not seen, and the deviation among them; "
+        "success is the share of scenes that reach their goal.\n"
+        "The plan by gradients is for one scene, in which the trained network is tested too."
+    )
+    notes = [f"- {common.describe(result['environment'])}" for result in results]
+    return "\n\n".join([intro, *map(envs_ppo.table, results), "\n".join(notes)])
 
 
 def implicit_costs(results: list[dict[str, Any]]) -> str:
@@ -660,7 +676,9 @@ def documents(directory: Path) -> dict[Path, str]:
     details = "\n\n".join(f"### {title}\n\n{text}" for title, text in sections(directory).items())
     measured = details.replace("](benchmarks/", "](../benchmarks/")
     costs = implicit_costs(common.read(directory, "implicit_cost_*.json"))
-    return {README: overview(directory), MEASURED: measured, IMPLICIT: costs, **migrating(directory)}
+    by_ppo = learning(common.read(directory, "envs_ppo.json"))
+    pages = {README: overview(directory), MEASURED: measured, IMPLICIT: costs, ENVS: by_ppo}
+    return pages | migrating(directory)
 
 
 def insert(text: str, tables: str) -> str:

@@ -1,0 +1,120 @@
+"""PPO on the tasks of `torch_mpm.envs`: returns before and after, and times.
+
+    python -m benchmarks.envs_ppo             # a quarter of an hour on 2 cores
+    python -m benchmarks.envs_ppo --quick     # seconds
+
+Each task is trained once by examples/learn_ppo.py, from seed 0, and tested without the noise of the training in as many
+scenes that the training has not seen. A return is the sum of the rewards of an episode. The plan is the best one of
+examples/plan_tasks.py, for the scene of seed 0 alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from . import common
+
+
+def example() -> Any:
+    """The example as a module, which imports another one."""
+    folder = str(common.ROOT / "examples")
+    if folder not in sys.path:
+        sys.path.append(folder)
+    import learn_ppo
+
+    return learn_ppo
+
+
+def measure(names: Sequence[str], quick: bool) -> dict[str, Any]:
+    learn = example()
+    result: dict[str, Any] = {"environment": common.environment(), "tasks": []}
+    for name in names:
+        training = learn.TRAININGS[name]
+        if quick:
+            training = training._replace(steps=240, scenes=2, steps_per_update=40)
+        begin = time.perf_counter()
+        trained = learn.train(name, training)
+        seconds = time.perf_counter() - begin
+        network, plan = learn.beside_the_plan(name, trained.policy, "cpu")
+        result["tasks"].append({
+            "name": name,
+            "training": {
+                "steps": trained.steps,
+                "scenes": training.scenes,
+                "failed": trained.failed,
+                "seconds": seconds,
+            },
+            "test": {
+                "untrained": trained.before.returns.mean().item(),
+                "trained": trained.after.returns.mean().item(),
+                "deviation": trained.after.returns.std().item(),
+                "success": trained.after.success.double().mean().item(),
+            },
+            "scene 0": {"trained": network, "plan": plan},
+            "curve": {
+                "steps": [steps for steps, _ in trained.curve],
+                "returns": [float(f"{value:.4g}") for _, value in trained.curve],
+            },
+        })  # fmt: skip
+        print({key: result["tasks"][-1][key] for key in ("name", "training", "test", "scene 0")}, flush=True)
+    return result
+
+
+def table(result: dict[str, Any]) -> str:
+    header = (
+        "task", "steps", "scenes", "untrained", "trained", "deviation", "success", "trained, scene 0", "plan, scene 0",
+        "failed", "time [s]",
+    )  # fmt: skip
+    rows = []
+    for task in result["tasks"]:
+        test, training = task["test"], task["training"]
+        rows.append((
+            *(task["name"], training["steps"], training["scenes"], test["untrained"], test["trained"]),
+            *(test["deviation"], test["success"], task["scene 0"]["trained"], task["scene 0"]["plan"]),
+            *(training["failed"], training["seconds"]),
+        ))  # fmt: skip
+    return common.table(header, rows)
+
+
+def text(result: dict[str, Any]) -> str:
+    about = (__doc__ or "").split("\n\n", 2)[2].strip()
+    parts = ["# PPO", common.describe(result["environment"]), about, table(result), "![](envs_ppo.png)"]
+    return "\n\n".join(parts)
+
+
+def plot(result: dict[str, Any], path: Path) -> None:
+    """Mean return of the episodes of the training, and those of the test, over the steps of the environment."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10, 3 * -(-len(result["tasks"]) // 3)), layout="constrained")
+    places = figure.subplots(-(-len(result["tasks"]) // 3), 3, squeeze=False).flat
+    for task, place in zip(result["tasks"], places, strict=False):
+        place.plot(*task["curve"].values(), color="C0", label="training")
+        for key, color in (("untrained", "C7"), ("trained", "C1")):
+            place.axhline(task["test"][key], color=color, linestyle="--", label=f"{key}, test")
+        place.set(title=task["name"], xlabel="steps", ylabel="return")
+        place.grid(alpha=0.3)
+    figure.axes[0].legend(loc="lower right")
+    figure.savefig(path, dpi=80)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="few steps of one task, to see that it works")
+    parser.add_argument("--tasks", nargs="+", choices=tuple(example().TRAININGS))
+    parser.add_argument("--out", type=Path, default=common.RESULTS)
+    arguments = parser.parse_args()
+    names = arguments.tasks or (["push"] if arguments.quick else list(example().TRAININGS))
+    with common.one_thread():
+        result = measure(names, arguments.quick)
+    common.write(arguments.out, "envs_ppo", result, text(result))
+    plot(result, arguments.out / "envs_ppo.png")
+
+
+if __name__ == "__main__":
+    main()
