@@ -49,7 +49,7 @@ def scene(dx: float, device: str) -> tuple[FreeBodies, mpm.State, torch.Tensor]:
     return FreeBodies(step, discs), water, torch.tensor([rows], dtype=torch.float64, device=device)
 
 
-def float_discs(dx: float = 0.02, seconds: float = 4.0, device: str = "cpu") -> dict[str, list]:
+def float_discs(dx: float = 0.02, seconds: float = 5.0, device: str = "cpu") -> dict[str, list]:
     """Times [s], positions of the water, and centres and angles of the discs [K, 3]."""
     bodies, state, rows = scene(dx, device)
     dt = 0.4 * float(bodies.step.stable_dt(state, 1.0))
@@ -98,7 +98,7 @@ def _turn(angle: float):
     return render.shapes.rotation_matrix(angle, 2)
 
 
-def main(out: Path, device: str = "cpu", dx: float = 0.02, seconds: float = 4.0) -> list[float]:
+def main(out: Path, device: str = "cpu", dx: float = 0.02, seconds: float = 5.0) -> list[float]:
     """Returns the heights of the water above the centres, over the radius."""
     out.mkdir(parents=True, exist_ok=True)
     found = float_discs(dx, seconds, device)

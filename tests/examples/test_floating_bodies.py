@@ -20,7 +20,7 @@ def test_discs_float_within_half_a_cell(tmp_path):
     pytest.importorskip("imageio_ffmpeg")
     floating, dx = example("floating_bodies"), 0.03
     with torch.no_grad():
-        measured = floating.main(tmp_path, dx=dx, seconds=3.0)
+        measured = floating.main(tmp_path, dx=dx, seconds=4.5)
     for density, height in zip(floating.DENSITIES, measured, strict=True):
         exact = floating.height_of_water_line(density)
         assert abs(height - exact) * floating.RADIUS < 0.5 * dx, density
