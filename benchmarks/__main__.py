@@ -47,6 +47,7 @@ PROGRAMS = (
     "benchmarks.stability.heat_step",
     "benchmarks.stability.sand",
     "benchmarks.stability.collapse",
+    "benchmarks.stability.bodies",
 )
 ON_DEVICE = (
     "benchmarks.speed.step",

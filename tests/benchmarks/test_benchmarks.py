@@ -57,6 +57,15 @@ def test_coupling_program_divides_the_time_of_a_step(tmp_path: Path) -> None:
     assert all(min(run["us"].values()) > 0 for run in found["steps"])
 
 
+@pytest.mark.thorough
+def test_bodies_are_stable_where_the_velocity_is_solved_for(tmp_path: Path) -> None:
+    """Light discs, which an exchange after each step throws away."""
+    run_quick("benchmarks.stability.bodies", tmp_path)
+    rows = result(tmp_path, "stability_bodies.json")["rows"]
+    assert len(rows) == 6 and max(row["solved"] for row in rows) < 1.001
+    assert all(row["one exchange"] > 100 for row in rows if row["ratio"] < 0.01)
+
+
 def test_failed_part_is_reported_and_the_others_go_on(monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*_: object) -> None:
         raise RuntimeError("no such device")
