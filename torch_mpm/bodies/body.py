@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ..boundaries.obstacles import Obstacle
 from ..errors import check_number, check_vector, shape_of
+from ..geometry.values import filled
 from .exchange import Part, parts_of, swirl
 
 
@@ -21,7 +22,7 @@ class Joint:
         return None
 
     def arm(self, position: Tensor) -> Tensor | None:
-        """Way from the fixed point to the position [B, D] [m]; None without such a point."""
+        """Vector from the fixed point to the position [B, D] [m]; None without such a point."""
         return None
 
     def check_dimension(self, dim: int) -> None:
@@ -45,11 +46,11 @@ class Hinge(Joint):
             raise ValueError(f"hinge must have an anchor of {dim} numbers and, in 3-D alone, an axis of 3")
 
     def arm(self, position: Tensor) -> Tensor | None:
-        return position - position.new_tensor(self.anchor)
+        return position - filled(self.anchor, position)
 
     def directions(self, position: Tensor) -> Tensor | None:
-        arm = position - position.new_tensor(self.anchor)
-        spin = arm.new_tensor([1.0] if self.axis is None else self.axis).expand(len(arm), -1)
+        arm = position - filled(self.anchor, position)
+        spin = filled([1.0] if self.axis is None else self.axis, arm).expand(len(arm), -1)
         velocity = swirl(spin[:, 0] if self.axis is None else spin, arm)
         return torch.cat([velocity, spin], 1)[..., None]
 
@@ -70,7 +71,7 @@ class Slider(Joint):
 
     def directions(self, position: Tensor) -> Tensor | None:
         way = [*self.axis, *[0.0] * (1 if len(self.axis) == 2 else 3)]
-        return position.new_tensor(way).expand(len(position), -1)[..., None]
+        return filled(way, position).expand(len(position), -1)[..., None]
 
 
 class Driven(Joint):
@@ -85,7 +86,8 @@ class Body:
     """A rigid body, whose frame has its centre of mass as origin.
 
     Args:
-        parts: an obstacle, a `Part`, or a list of these; shapes that the kernel of contact knows.
+        parts: an obstacle, a `Part`, or a list of these; shapes that the kernel of contact knows. Steps assign their
+            position, rotation and velocities.
         mass: [kg], positive.
         inertia: moment of inertia about the centre of mass [kg m²], positive: a number in 2-D; in 3-D a number, or
             three for the axes of the frame.
@@ -130,15 +132,16 @@ class Body:
         if dim == 2:
             matrix[:, 2, 2] = self.inertia[0]
         else:
-            matrix[:, 3:, 3:] = turn @ torch.diag(turn.new_tensor(self.inertia).expand(3)) @ turn.mT
+            inertia = self.inertia if len(self.inertia) == 3 else self.inertia * 3
+            matrix[:, 3:, 3:] = turn @ torch.diag(filled(inertia, turn)) @ turn.mT
         return matrix
 
 
 def mobility(matrix: Tensor, directions: Tensor | None) -> Tensor:
     """Velocities by impulses [B, n, n]: S (Sᵀ M S)⁻¹ Sᵀ for the mass matrix M and the directions S."""
     if directions is None:
-        return torch.linalg.inv(matrix)
-    return directions @ torch.linalg.solve(directions.mT @ matrix @ directions, directions.mT)
+        return torch.linalg.inv_ex(matrix)[0]
+    return directions @ torch.linalg.solve_ex(directions.mT @ matrix @ directions, directions.mT)[0]
 
 
 def _unit(name: str, vector: Sequence[float]) -> tuple[float, ...]:

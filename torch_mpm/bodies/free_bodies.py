@@ -1,13 +1,14 @@
 """Rigid bodies that the material pushes: their velocities are solved for together with the contact of the nodes.
 
-A body with the velocity U* at the end of a step, but for the material, takes the impulses p of the nodes that it meets,
-which depend on its velocity U at the end of the step:
+A body has a velocity and an angular velocity U [m/s, 1/s] at the end of a step. Without the material they were U*. The
+nodes that it meets give it impulses p(U) [N s, N m s], which depend on U:
 
     U = U* + W p(U),
 
-with its mobility W, the inverse of mass and inertia, as far as a joint leaves the body free. The impulses are those of
-`torch_mpm.ops.contact_impulses`. Newton's method solves these 3 (2-D) or 6 (3-D) equations; −dp/dU is the mass of the
-nodes that follow the body, so that light bodies are stable at the time step of the material.
+with its mobility W [1/kg, 1/(kg m²)], the inverse of mass and inertia, as far as a joint leaves the body free. The
+impulses are those of `torch_mpm.ops.contact_impulses`. Newton's method solves these equations, 3 (2-D) or 6 (3-D) of
+each of the K bodies of a scene together; −dp/dU is the mass of the nodes that follow the bodies, so that light bodies
+are stable at the time step of the material.
 """
 
 from __future__ import annotations
@@ -23,20 +24,23 @@ from torch import Tensor
 from ..boundaries.motion import rotation_matrix
 from ..cuda_graphs.capture import is_readable
 from ..errors import FLOATING, SimulationError, check_count, check_number, check_vector, shape_of
+from ..geometry.values import filled
 from ..grid.grid import Blocks
 from ..ops.autograd import dispatch, graph_at_once
-from ..ops.contact import MAX_OBSTACLES, is_of_kernel, obstacle_arguments, packed_rows, walls_beside
+from ..ops.contact import MAX_OBSTACLES, fusible, obstacle_arguments, packed_rows, walls_beside
 from ..state.state import State, check_state
 from ..step.step import Step
-from .body import Body, mobility
+from .body import Body, Driven, Joint, mobility
 from .exchange import POSE, VELOCITY, Frames, Motion, assign, check_bodies, motion_of, moved, swirl
 
-MOST_ITERATIONS = 20
+MAX_ITERATIONS = 20
 """Iterations of Newton's method where the host reads the residual."""
-ITERATIONS_UNREAD = 6
-"""Iterations where it does not, on CUDA: most steps need 1 to 4."""
+ITERATIONS_ON_CUDA = 8
+"""Iterations where it does not: most steps need 1 to 4."""
 TOLERANCE = {torch.float64: 1e-12, torch.float32: 1e-5}
 """Residual of velocities, relative to those of the bodies and by the impulses, by the dtype of the nodes."""
+NOT_ALLOWED = 1e-5
+"""Largest share of a velocity that a joint does not allow."""
 
 
 class BodyReport(NamedTuple):
@@ -44,7 +48,8 @@ class BodyReport(NamedTuple):
 
     Attributes:
         iterations: the largest number of iterations of a step.
-        residual: largest residual of a step, relative to the velocities [B, K].
+        residual: largest residual of a step [B, K], relative to the velocities and to what their rounding to the dtype
+            of the nodes changes.
         converged: whether all residuals are within the tolerance, bool [B, K].
     """
 
@@ -120,6 +125,12 @@ class FreeBodies:
         check_bodies(bodies, state, self.step.grid, len(self))
         check_number("dt", dt, "positive and finite", lambda v: 0 < v < math.inf)
         self._check_wrenches(wrenches, bodies)
+        if torch.is_inference_mode_enabled() or torch._C._are_functorch_transforms_active():
+            raise NotImplementedError(
+                "free bodies differentiate the contact of the nodes: use torch.no_grad() in place of inference_mode, "
+                "and torch.autograd in place of torch.func"
+            )
+        self._check_joints(bodies)
         if self.step.on_grid is not None:
             raise ValueError("a step with bodies must have no on_grid of its own")
         now = bodies.double()
@@ -135,6 +146,7 @@ class FreeBodies:
             now = solution.rows
             worst, most = torch.maximum(worst, solution.residual), max(most, solution.iterations)
         self.report = BodyReport(most, worst, worst <= TOLERANCE[state.x.dtype])
+        assign(self.obstacles, self.frames.motion(motion_of(now.detach(), self.step.grid.dim)), 0.0)
         return state, now
 
     def _check_wrenches(self, wrenches: Tensor | None, bodies: Tensor) -> None:
@@ -161,14 +173,28 @@ class FreeBodies:
             residual = float(self.report.residual[scene, body])
             raise SimulationError(
                 f"the velocity of body {body} of scene {scene} has not converged with the contact of the nodes: its "
-                f"residual is {residual:.1e} of the velocities; use a smaller dt"
+                f"residual is {residual:.1e} of the velocities; friction of more than 2 on a light body may be the "
+                "cause, or a dt that is too large"
             )
+
+    def _check_joints(self, bodies: Tensor) -> None:
+        """Refuse velocities that a joint does not allow, where they can be read."""
+        if not is_readable(bodies) or all(type(body.joint) in (Joint, Driven) for body in self.bodies):
+            return
+        solution = _Solution(self, bodies.detach().double(), 1.0, None)
+        own = solution.begin[..., POSE[self.step.grid.dim] :]
+        allowed = (solution.mobility @ solution.mass @ own[..., None])[..., 0]
+        wrong = solution.size_of(own - allowed) > NOT_ALLOWED * solution.size_of(own)
+        for k, body in enumerate(self.bodies):
+            if not isinstance(body.joint, Driven) and bool(wrong[:, k].any()):
+                kind = type(body.joint).__name__.lower()
+                raise ValueError(f"bodies must have velocities that their joints allow, and body {k} is on a {kind}")
 
     def gravity_like(self, rows: Tensor) -> Tensor:
         """Gravity in the dtype of rows, [D] or [B, 1, D]."""
         dim = self.step.grid.dim
         if self.gravity is not None:
-            return rows.new_tensor(self.gravity)
+            return filled(self.gravity, rows)
         found = self.step.gravity_like(rows)
         if found is None:
             return rows.new_zeros(dim)
@@ -195,10 +221,10 @@ class _Solution:
         self.rows, self.residual, self.iterations = rows, rows.new_zeros(rows.shape[:2]), 0
 
     def _predicted(self, wrenches: Tensor | None) -> Tensor:
-        """Velocities at the end of the step but for the material [B, K, n]."""
+        """Velocities at the end of the step without the material [B, K, n]."""
         velocity = self.begin[..., POSE[self.dim] :]
         force = torch.zeros_like(velocity)
-        masses = force.new_tensor([body.mass for body in self.of.bodies])
+        masses = filled([body.mass for body in self.of.bodies], force)
         force[..., : self.dim] = masses[:, None] * self.of.gravity_like(self.begin)
         if wrenches is not None:
             force = force + wrenches.double()
@@ -212,7 +238,7 @@ class _Solution:
         if torch.is_grad_enabled():
             # One more iteration with a graph has the gradient of the solution, by the implicit function theorem.
             gap = U - self.predicted - self._applied(contact.impulses(U))
-            U = U - torch.linalg.solve(jacobian(), gap)
+            U = U - _SolvedOnce.apply(jacobian(), gap)
         self.rows = self._end(self.predicted + self._applied(contact.impulses(U)))
         return contact.velocity_after(U)
 
@@ -222,21 +248,23 @@ class _Solution:
         return (self.mobility @ impulses[..., None])[..., 0]
 
     def _residual(self, contact: _BodyContact, U: Tensor) -> tuple[Tensor, Callable[[], Tensor]]:
-        """Residuals [B, K, n] of velocities U, and a function that computes their derivatives by these [B, K, n, n]."""
+        """Residuals [B, K, n] of velocities U, and a function that computes their derivatives by these
+        [B, K n, K n]."""
         with torch.enable_grad(), graph_at_once():
             leaf = U.detach().requires_grad_()
             p = contact.impulses(leaf)
 
         def derivative() -> Tensor:
             with torch.enable_grad():
-                sums = p.sum((0, 1)).unbind()
-            columns = [torch.autograd.grad(total, leaf, retain_graph=True)[0] for total in sums]
-            eye = torch.eye(p.shape[2], dtype=p.dtype, device=p.device)
-            return eye - self.mobility.detach() @ torch.stack(columns, 2)
+                sums = p.sum(0).flatten().unbind()
+            rows = [torch.autograd.grad(total, leaf, retain_graph=True)[0].flatten(1) for total in sums]
+            by_body = torch.stack(rows, 1).unflatten(1, p.shape[1:])
+            applied = (self.mobility.detach() @ by_body).flatten(1, 2)
+            return torch.eye(applied.shape[1], dtype=p.dtype, device=p.device) - applied
 
         return U - self.predicted.detach() - self._applied(p.detach()).detach(), derivative
 
-    def _size(self, velocities: Tensor) -> Tensor:
+    def size_of(self, velocities: Tensor) -> Tensor:
         """Speeds [B, K] of velocities [B, K, n]; of rotation that at the radius of gyration."""
         inertia = self.mass.diagonal(dim1=2, dim2=3)[..., self.dim :].mean(2)
         squared = velocities[..., : self.dim].square().sum(2)
@@ -245,26 +273,30 @@ class _Solution:
 
     def _solve(self, contact: _BodyContact) -> tuple[Tensor, Callable[[], Tensor]]:
         """Velocities [B, K, n] at the end of the step, and the derivative of the residual there."""
-        U = self.predicted.detach()
+        U, dtype = self.predicted.detach(), contact.velocity.dtype
         residual, derivative = self._residual(contact, U)
-        size = self._size(residual)
-        scale = self._size(self.predicted) + size + torch.finfo(U.dtype).tiny
-        dtype = contact.velocity.dtype
-        tolerance, reads, share = 0.1 * TOLERANCE[dtype], is_readable(U), torch.ones_like(scale)
-        for _ in range(MOST_ITERATIONS if reads else ITERATIONS_UNREAD):
-            if reads and bool((size <= tolerance * scale).all()):
+        size = self.size_of(residual)
+        scale = self.size_of(self.predicted) + size + torch.finfo(U.dtype).tiny
+        reads, share = is_readable(U), torch.ones_like(scale[:, 0])
+        for _ in range(MAX_ITERATIONS if reads else ITERATIONS_ON_CUDA):
+            if reads and bool((size <= 0.1 * TOLERANCE[dtype] * scale).all()):
                 break
             self.iterations += 1
-            trial = U - share[..., None] * torch.linalg.solve(derivative(), residual)
+            jacobian = derivative()
+            # Velocities are rounded to the dtype of the nodes, whose impulses change accordingly.
+            rounded = torch.finfo(dtype).eps * (jacobian - torch.eye(jacobian.shape[1]).to(jacobian)).norm(dim=(1, 2))
+            scale = torch.maximum(scale, (rounded[:, None] * self.size_of(U)) / TOLERANCE[dtype])
+            step = torch.linalg.solve_ex(jacobian, residual.flatten(1))[0].view_as(U)
+            trial = U - share[:, None, None] * step
             found, of_trial = self._residual(contact, trial)
-            better = self._size(found) < size
+            better = self.size_of(found).norm(dim=1) < size.norm(dim=1)
             share = torch.where(better, 1.0, 0.5 * share)
             if reads and bool(better.all()):
                 U, residual, derivative = trial, found, of_trial
             else:
-                U = torch.where(better[..., None], trial, U)
+                U = torch.where(better[:, None, None], trial, U)
                 residual, derivative = self._residual(contact, U)
-            size = self._size(residual)
+            size = self.size_of(residual)
         self.residual = size / scale
         return U, derivative
 
@@ -272,23 +304,70 @@ class _Solution:
 
     def _end(self, U: Tensor) -> Tensor:
         """Rows [B, K, 13] or [B, K, 6] at the end of a step with velocities U."""
-        pose = moved(torch.cat([self.begin[..., : POSE[self.dim]], U], 2), self.dt)
-        turn = rotation_matrix(motion_of(torch.cat([pose, U], 2), self.dim).rotation, self.dim)
-        ends = []
-        for k, body in enumerate(self.of.bodies):
-            place, own = pose[:, k], U[:, k]
-            arm = body.joint.arm(self.motion.position[:, k])
-            if arm is not None:  # on the circle about the fixed point
-                way = (turn[:, k] @ self.turn[:, k].mT @ arm[..., None])[..., 0]
-                place = torch.cat([self.motion.position[:, k] - arm + way, place[:, self.dim :]], 1)
-                spin = own[:, self.dim] if self.dim == 2 else own[:, self.dim :]
-                own = torch.cat([swirl(spin, way), own[:, self.dim :]], 1)
-            elif self.dim == 3 and body.joint.directions(place[:, :3]) is None:  # keeps its angular momentum
-                momentum = self.mass[:, k, 3:, 3:] @ own[:, 3:, None]
-                spin = torch.linalg.solve(body.mass_matrix(turn[:, k])[:, 3:, 3:], momentum)[..., 0]
-                own = torch.cat([own[:, :3], spin], 1)
-            ends.append(torch.cat([place, own], 1))
-        return torch.stack(ends, 1)
+        return torch.stack([self._end_of(k, body, U[:, k]) for k, body in enumerate(self.of.bodies)], 1)
+
+    def _end_of(self, k: int, body: Body, U: Tensor) -> Tensor:
+        """Rows [B, 13] or [B, 6] of one body at the end of a step with velocities U [B, n]."""
+        dim, place, old = self.dim, self.motion.position[:, k], self.turn[:, k]
+        is_free = body.joint.directions(place) is None
+        spin = U[:, dim:]
+        if dim == 3 and is_free:  # By the spin in the middle of the step, which is of second order.
+            momentum = self.mass[:, k, 3:, 3:] @ spin[..., None]
+            spin = _spin(body, self._pose(k, U[:, :dim], spin, 0.5 * self.dt), momentum)
+        pose = self._pose(k, U[:, :dim], spin, self.dt)
+        arm = body.joint.arm(place)
+        if arm is not None:  # on the circle about the fixed point
+            way = (_rotations(pose, dim) @ old.mT @ arm[..., None])[..., 0]
+            pose = torch.cat([place - arm + way, pose[:, dim:]], 1)
+            return torch.cat([pose, swirl(spin[:, 0] if dim == 2 else spin, way), spin], 1)
+        if dim == 3 and is_free:  # keeps its angular momentum
+            spin = _spin(body, pose, momentum)
+        return torch.cat([pose, U[:, :dim], spin], 1)
+
+    def _pose(self, k: int, velocity: Tensor, spin: Tensor, seconds: float) -> Tensor:
+        """Poses of one body [B, 7] or [B, 3] after some time with constant velocities."""
+        pose = self.begin[:, k, : POSE[self.dim]]
+        return moved(torch.cat([pose, velocity, spin], 1)[:, None], seconds)[:, 0]
+
+
+def _rotations(pose: Tensor, dim: int) -> Tensor:
+    """Rotation matrices [B, D, D] of poses [B, 7] or [B, 3]."""
+    rows = torch.cat([pose, pose.new_zeros(len(pose), VELOCITY[dim])], 1)[:, None]
+    return rotation_matrix(motion_of(rows, dim).rotation, dim)[:, 0]
+
+
+def _spin(body: Body, pose: Tensor, momentum: Tensor) -> Tensor:
+    """Angular velocity [B, 3] of a body at a pose [B, 7] by its angular momentum [B, 3, 1]."""
+    return torch.linalg.solve_ex(body.mass_matrix(_rotations(pose, 3))[:, 3:, 3:], momentum)[0][..., 0]
+
+
+class _SolvedOnce(torch.autograd.Function):
+    """J⁻¹ r for a constant matrix J [B, m, m] and r [B, K, n].
+
+    An iteration of Newton's method has the first derivatives of the solution, and not the second ones.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, jacobian: Tensor, gap: Tensor) -> Tensor:
+        ctx.save_for_backward(jacobian)
+        return torch.linalg.solve_ex(jacobian, gap.flatten(1))[0].view_as(gap)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[None, Tensor]:
+        (jacobian,) = ctx.saved_tensors
+        return None, _FirstDerivative.apply(torch.linalg.solve_ex(jacobian.mT, grad.flatten(1))[0].view_as(grad))
+
+
+class _FirstDerivative(torch.autograd.Function):
+    """A gradient that refuses to be differentiated; `once_differentiable` alone leaves such a path out in silence."""
+
+    @staticmethod
+    def forward(ctx: Any, gradient: Tensor) -> Tensor:
+        return gradient.clone()
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
+        raise NotImplementedError("free bodies have no second derivatives")
 
 
 class _BodyContact:
@@ -355,8 +434,10 @@ def _check_obstacle(k: int, obstacle: Any, known: set[int]) -> None:
     known.add(id(obstacle))
     if obstacle.start != 0 or obstacle.end != math.inf or obstacle.scene is not None:
         raise ValueError(f"obstacles of body {k} must act at all times and in all scenes")
-    if not is_of_kernel(obstacle, 0.0):
+    if obstacle.shape.number is None:
         raise ValueError(
             f"obstacles of body {k} must have shapes that the kernel of contact knows, got a {obstacle.shape.name}: "
             "convert it by torch_mpm.shapes.Sampled.of"
         )
+    if not fusible(obstacle, 0.0):
+        raise ValueError(f"obstacles of body {k} must have no hooks and no functions of their own")
