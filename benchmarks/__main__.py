@@ -37,6 +37,7 @@ PROGRAMS = (
     "benchmarks.accuracy.ritter",
     "benchmarks.accuracy.runout",
     "benchmarks.accuracy.limits",
+    "benchmarks.accuracy.obstacle_surfaces",
     "benchmarks.accuracy.locking",
     "benchmarks.accuracy.rollout_gradients",
     "benchmarks.stability.stable_dt",
