@@ -6,10 +6,11 @@
 - Incline: an elastic block (E = 1e7 Pa, 12 by 6 cells) on a plane that is inclined against the lattice. It settles on a
   sticky plane, damped by PIC, and is let go: its acceleration in the second half of a second over which it slides, and
   g (sin a − μ cos a) where that is positive; otherwise it should stick.
-- Rolling: a free disc that starts at rest on an elastic bed (E = 1e5 Pa) in gravity that is inclined by an angle. Its
-  acceleration over 2/3 g sin a, that of a disc on a rigid plane, by least squares over the last three quarters of the
-  time; and the distance that it travels over that of its turns, R times the angle. On sand: a disc that rolls at 1 m/s
-  over a level bed, its speed at the end, the same ratio, and the coefficient of rolling resistance 3/2 a/g.
+- Rolling: a free disc rolls from rest on an elastic bed (E = 1e5 Pa) in gravity that is inclined by an angle. Its
+  acceleration, by least squares over the last three quarters of a second, beside 2/3 g sin a, that of a disc on a rigid
+  plane; the distance that it travels over R times the angle that it turns; and the resistance, the energy that it loses
+  over its weight and that distance. On level sand: a disc that begins to roll at 2 m/s, for half a second. It skids, as
+  rigid wheels do that are towed through sand (Wong and Reece 1967).
 - Drops: the largest depth d of balls that fall on sand, over (0.14/μ) (ρ_s/ρ_g)^½ D^⅔ H^⅓, measured for spheres
   (Uehara et al. 2003) with H the height of the fall and d, μ = tan φ. A quarter of a sphere between mirrors (3-D), and
   half of a disc (2-D), for which no law of this accuracy is published: a force in proportion to the depth alone has
@@ -152,12 +153,13 @@ def roll(
     mass = DENSITY * math.pi * RADIUS**2
     body = Body(step, disc, (0.5, BED[1] + RADIUS), mass, 0.5 * mass * RADIUS**2)
     n, dt = 2, 0.4 * float(step.stable_dt(state, 1.0))
-    settling = round(0.3 / (n * dt))
+    settling = round(0.6 / (n * dt))
     for k in range(settling):  # under the part of gravity that presses the disc on the bed
         state = body.advance(state, n, dt, (0.0, 1.0, 0.0))
         if k < 0.8 * settling:
-            state = still(state, 0.95)
-            body.velocity[:] *= 0.95
+            share = math.exp(-30.0 * n * dt)
+            state = still(state, share)
+            body.velocity[:] *= share
     step.gravity = (GRAVITY * math.sin(a), -GRAVITY * math.cos(a))
     body.velocity[:] = torch.tensor([speed, 0.0, -speed / RADIUS], dtype=F64)
     rows = [body.row[0, 0]]
@@ -171,14 +173,16 @@ def roll(
 def _rolled(rows: Tensor, interval: float, found: dict[str, Any]) -> dict[str, Any]:
     seconds = torch.arange(len(rows), dtype=F64) * interval
     later = slice(len(rows) // 4, None)
-    x, turn = rows[later, 0], rows[later, 2]
-    exact = 2 / 3 * GRAVITY * math.sin(math.radians(found["angle"]))
+    slope = math.sin(math.radians(found["angle"]))
+    along, turned = float(rows[-1, 0] - rows[0, 0]), float(rows[0, 2] - rows[-1, 2])
+    energy = rows[:, 3:5].square().sum(1) / 2 + (RADIUS * rows[:, 5]).square() / 4 - GRAVITY * slope * rows[:, 0]
     return {
         **found,
         "acceleration": float(np.polyfit(seconds[later].numpy(), rows[later, 3].numpy(), 1)[0]),
-        "rigid": exact,
-        "ratio": float((x[-1] - x[0]) / (RADIUS * (turn[0] - turn[-1]))),
+        "rigid": 2 / 3 * GRAVITY * slope,
+        "ratio": along / (RADIUS * turned),
         "end": float(rows[-1, 3]),
+        "resistance": float(energy[0] - energy[-1]) / (GRAVITY * along),
     }
 
 
@@ -349,7 +353,7 @@ def measure(quick: bool) -> dict[str, Any]:
         "inclines": [lambda a=a, s=s: incline(a, s * math.tan(math.radians(a))) for a, s in INCLINES],
         "momentum": [lambda m=m, k=k: momentum(m, k) for m in LAWS for k in ("separate", "sticky")],
         "jelly": [lambda c=c, a=a: roll(c, a, jelly()) for c, a in ((6, 10), (12, 10), (24, 10), (12, 20))],
-        "sand": [lambda c=c: roll(c, 0, sand, 1.0, density=SAND_DENSITY) for c in (6, 12)],
+        "sand": [lambda c=c: roll(c, 0, sand, 2.0, 0.5, SAND_DENSITY) for c in (6, 12)],
         "drops": [lambda: drops(2, 0.025, ()), lambda: drops(2, 0.0125, ()), lambda: drops(3, 0.025, (1.0, 2.0, 4.0))],
         "floating": [lambda c=c, m=m, d=d: floating(c, m, d) for c in (6, 12) for m in (0, 0.75) for d in (0.5, 0.8)],
     }
@@ -407,9 +411,8 @@ def _rolls(rows: list[dict[str, Any]]) -> str:
     )
     cells = []
     for row in rows:
-        numbers = (f"{row[key]:.3f}" for key in ("acceleration", "rigid", "ratio", "end"))
-        resistance = 1.5 * (row["rigid"] - row["acceleration"]) / GRAVITY
-        cells.append((row["cells"], f"{row['angle']}°", *numbers, f"{resistance:.3f}"))
+        numbers = (f"{row[key]:.3f}" for key in ("acceleration", "rigid", "ratio", "end", "resistance"))
+        cells.append((row["cells"], f"{row['angle']}°", *numbers))
     return common.table(header, cells)
 
 
