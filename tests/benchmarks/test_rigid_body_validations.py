@@ -19,7 +19,7 @@ def one_thread() -> Iterator[None]:
 @pytest.mark.parametrize("angle", [10, 30])
 def test_a_block_slides_or_sticks_on_an_incline(angle, share):
     """At g (sin a − μ cos a) below μ = tan a, and not at all above."""
-    found = rigid_bodies.incline(angle, share * math.tan(math.radians(angle)), duration=0.3)
+    found = rigid_bodies.incline(angle, share * math.tan(math.radians(angle)))
     assert found["acceleration"] == pytest.approx(found["rigid"], rel=0.02, abs=0.01)
     assert (abs(found["speed"]) < 1e-3) == (share > 1)
 
