@@ -38,6 +38,8 @@ PROGRAMS = (
     "benchmarks.accuracy.ritter",
     "benchmarks.accuracy.runout",
     "benchmarks.accuracy.limits",
+    "benchmarks.accuracy.obstacle_surfaces",
+    "benchmarks.accuracy.rigid_bodies",
     "benchmarks.accuracy.locking",
     "benchmarks.accuracy.rollout_gradients",
     "benchmarks.stability.stable_dt",

@@ -206,12 +206,17 @@ def start(case: Container, dx: float) -> tuple[mpm.Step, mpm.State, list[Any]]:
     points = mpm.seed.Points(points.x[free], points.volume[free])
     law = mpm.WeaklyCompressible(BULK, GAMMA, VISCOSITY)
     step = mpm.Step(grid, law, (0.0, -GRAVITY, 0.0)[:dim], walls=case.walls, boundaries=obstacles)
-    state = step.prepare(mpm.State.at_rest(points, DENSITY, dtype=torch.float32))
-    below = DEPTH - state.x[:, 1]
-    # p = K/γ (J^-γ − 1) with dp/dh = ρ g / J.
-    J = (1 + (GAMMA - 1) * DENSITY * GRAVITY / BULK * below) ** (-1 / (GAMMA - 1))
-    state = state.replace(J=J, volume=state.volume / J, mass=state.mass / J)
+    state = hydrostatic(step, mpm.State.at_rest(points, DENSITY, dtype=torch.float32), DEPTH)
     return step, step.with_impulses(state), obstacles
+
+
+def hydrostatic(step: mpm.Step, water: mpm.State, depth: float, gravity: float = GRAVITY) -> mpm.State:
+    """Water of a given depth above zero under its own pressure: p = K/γ (J^-γ − 1) with dp/dh = ρ g / J."""
+    law, state = step.law, step.prepare(water)
+    bulk, gamma = float(law.bulk_modulus), float(law.gamma)
+    density = state.mass / state.volume
+    J = (1 + (gamma - 1) * density * gravity / bulk * (depth - state.x[:, 1])) ** (-1 / (gamma - 1))
+    return state.replace(J=J, volume=state.volume / J, mass=state.mass / J)
 
 
 def distance(obstacles: list[Any], x: Tensor) -> Tensor:
