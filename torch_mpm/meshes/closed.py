@@ -13,13 +13,14 @@ from .. import optional
 from ..errors import shape_of
 from ..files import check_file
 from ..geometry.surface_mesh import Array
-from . import obj, off, ply
+from . import obj, off, ply, stl
 
 MERGED = 1e-5
 """Distance within which vertices on open edges are merged, in diagonals of the mesh."""
-READERS = {".obj": obj.read, ".off": off.read, ".ply": ply.read}
-"""Readers of formats with polygons, by the ends of names. Those of trimesh make fans of them, which also cover places
-outside of polygons that are not convex; for .obj it also counts negative indices from the last object of the file.
+READERS = {".obj": obj.read, ".off": off.read, ".ply": ply.read, ".stl": stl.read}
+"""Readers by the ends of names. Those of trimesh make fans of polygons, which also cover places outside of them where
+they are not convex; they count negative indices of an .obj from the last object of the file, and find no triangles in
+an .stl whose header declares another number.
 """
 NAMED = 3
 """Number of open edges whose positions a message lists."""
