@@ -114,7 +114,7 @@ def test_nodes_are_known_without_functions(device):
     np.testing.assert_allclose(solver.grid_mv.cpu().numpy()[m > 1e-15], grid[m > 1e-15], atol=1e-11)
     with pytest.raises(ValueError, match=r"grid_mv must have shape \[n³, 3\]"):
         solver.grid_mv = torch.zeros(3, 3)
-    solver.vol = torch.zeros(3)
+    solver.vol = torch.ones(3)
     with pytest.raises(ValueError, match="vol must be a number, or have shape"):
         solver(*tensors, stress_of(F))
 

@@ -129,6 +129,15 @@ def test_sums_that_are_not_those_of_the_scene(folder, tmp_path, place, name):
     assert len(problems) == 1 and "scene 0 has other statistics than its record says" in problems[0]
 
 
+@pytest.mark.parametrize("sealed", [None, "x", "0" * 64])
+def test_a_record_with_the_seal_of_another_shard(folder, tmp_path, sealed):
+    """`verify` finds what readers refuse."""
+    copy = shutil.copytree(folder, tmp_path / "copy")
+    datasets.forge(record_path(shard_path(copy, 0)), lambda words: words.update(seal=sealed))
+    problems = list(verify(copy))
+    assert len(problems) == 1 and "is another shard than that of its record" in problems[0]
+
+
 def lifted(arrays, attributes):
     words = json.loads(attributes["scene"])
     attributes["scene"] = json.dumps({k: v for k, v in words.items() if k != "obstacle"})

@@ -265,9 +265,9 @@ class Shard:
 
     Args:
         path: the .h5 file.
-        check: compare the whole file with its record first, which reads all of it; otherwise its size and all but the
-            numbers of its arrays are compared, once per process, and damage to the numbers is detected when they are
-            read. Shards without a seal, of older versions, are compared as a whole, once per process.
+        check: compare the whole file with its record first, which reads all of it; in any case its size and all but
+            the numbers of its arrays are compared, once per process, and damage to the numbers is detected when they
+            are read. Shards without a seal, of older versions, are compared as a whole, once per process.
 
     Raises:
         FileNotFoundError: for a missing or unfinished shard.
@@ -286,7 +286,7 @@ class Shard:
             raise DamagedFileError(self.path, "is not as long as its record says", REMEDY)
         if check:
             _check_whole(self.path, self.record.sha256)
-        else:
+        if self.record.seal or not check:
             state = (status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns)
             _check_once(self.path, self.record.sha256, self.record.seal, state)
         try:

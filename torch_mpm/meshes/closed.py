@@ -13,10 +13,15 @@ from .. import optional
 from ..errors import shape_of
 from ..files import check_file
 from ..geometry.surface_mesh import Array
-from . import obj
+from . import obj, off, ply, stl
 
 MERGED = 1e-5
 """Distance within which vertices on open edges are merged, in diagonals of the mesh."""
+READERS = {".obj": obj.read, ".off": off.read, ".ply": ply.read, ".stl": stl.read}
+"""Readers by the ends of names. Those of trimesh make fans of polygons, which also cover places outside of them where
+they are not convex; they count negative indices of an .obj from the last object of the file, and find no triangles in
+an .stl whose header declares another number.
+"""
 NAMED = 3
 """Number of open edges whose positions a message lists."""
 
@@ -102,14 +107,14 @@ def triangles(source: str | Path | Any) -> tuple[Array, Array]:
 
 
 def _read(path: Path) -> Any:
-    """A mesh of a file; trimesh reads all formats but .obj.
-
-    It would read negative indices of an .obj as those of the last object of the file.
-    """
+    """A mesh of a file, by `READERS` or trimesh."""
     import trimesh
 
-    if path.suffix.lower() == ".obj":
-        return trimesh.Trimesh(*obj.read(path), process=False)
+    read = READERS.get(path.suffix.lower())
+    if read is not None:
+        vertices, faces = read(path)
+        used, which = np.unique(faces, return_inverse=True)
+        return trimesh.Trimesh(vertices[used], which.reshape(-1, 3), process=False)
     return trimesh.load(str(path), force="mesh", resolver=_resolver(path))
 
 

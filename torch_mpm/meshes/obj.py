@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import codecs
-import itertools
 import re
 from array import array
 from pathlib import Path
@@ -11,13 +10,14 @@ from pathlib import Path
 import numpy as np
 
 from ..geometry.surface_mesh import Array
+from .polygons import triangulated
 
 
 def read(path: Path) -> tuple[Array, Array]:
-    """Vertices float64 [V, 3] that faces use, and triangles int64 [T, 3]; both empty without faces.
+    """Vertices float64 [V, 3] and triangles int64 [T, 3].
 
     Objects, groups and materials are one mesh. A negative index counts back from the latest vertex above its line.
-    Polygons are fans of triangles; lines, textures and normals are skipped.
+    Polygons are divided into triangles; lines, textures and normals are skipped.
 
     Raises:
         ValueError: for a vertex or a face that is not of numbers, and an index without a vertex, with its line, where
@@ -26,7 +26,7 @@ def read(path: Path) -> tuple[Array, Array]:
     text = path.read_bytes().removeprefix(codecs.BOM_UTF8)
     text = re.sub(rb"#[^\r\n]*", b"", text) if b"#" in text else text
     text = re.sub(rb"\\(\r\n|\r|\n)", b" ", text) if b"\\" in text else text
-    vertices, corners, number, line = array("d"), array("q"), 0, b""
+    vertices, corners, sizes, number, line = array("d"), array("q"), array("q"), 0, b""
     try:
         for line in text.splitlines():
             number += 1
@@ -35,17 +35,15 @@ def read(path: Path) -> tuple[Array, Array]:
                 x, y, z = words[1:4]
                 vertices.extend((float(x), float(y), float(z)))
             elif words and words[0] == b"f":
-                polygon = [_index(word, len(vertices) // 3) for word in words[1:]]
-                for second, third in itertools.pairwise(polygon[1:]):
-                    corners.extend((polygon[0], second, third))
+                corners.extend([_index(word, len(vertices) // 3) for word in words[1:]])
+                sizes.append(len(words) - 1)
     except ValueError as error:
         found = line.decode(errors="replace").strip()[:80]
         raise ValueError(f"its line {number} is not a vertex or a face: {found!r}, {error}") from None
-    faces = np.array(corners, dtype=np.int64).reshape(-1, 3)
-    if faces.size and faces.max() >= len(vertices) // 3:
-        raise ValueError(f"a face has the vertex {faces.max() + 1}, and there are {len(vertices) // 3}")
-    used, which = np.unique(faces, return_inverse=True)
-    return np.array(vertices, dtype=np.float64).reshape(-1, 3)[used], which.reshape(-1, 3)
+    positions, used = np.array(vertices, dtype=np.float64).reshape(-1, 3), np.array(corners, dtype=np.int64)
+    if used.size and used.max() >= len(positions):
+        raise ValueError(f"a face has the vertex {used.max() + 1}, and there are {len(positions)}")
+    return positions, triangulated(positions, used, np.array(sizes, dtype=np.int64))
 
 
 def _index(word: bytes, count: int) -> int:

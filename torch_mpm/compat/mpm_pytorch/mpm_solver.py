@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from ...boundaries import Damping
 from ...boundaries.apply import after_boundaries
+from ...cuda_graphs.capture import is_readable
 from ...errors import check_count, check_like, check_number, shape_of
 from ...grid.grid import Blocks, Grid
 from ...state.state import State
@@ -29,6 +31,21 @@ RESET_STEPS = 15
 """Number of steps for which a cuboid with `reset` stops its nodes after its end."""
 
 
+class Assigned(NamedTuple):
+    """Range of a number of the solver, also where it is assigned; `vol` and `p_mass` may be tensors."""
+
+    expected: str
+    holds: Callable[[float], bool]
+
+
+POSITIVE = Assigned("positive and finite", lambda v: 0 < v < math.inf)
+NUMBERS = {
+    "damping": Assigned("between 0 and 1", lambda v: 0 <= v <= 1),
+    "clip_bound": Assigned("not negative and below half of the cube", lambda v: 0 <= v < 0.5),
+    **{"dt": POSITIVE, "vol": POSITIVE, "p_mass": POSITIVE},
+}
+
+
 class MPMSolver:
     """A step of explicit MPM on the unit cube: forces by the gradient of quadratic B-splines, APIC, positions and F
     clamped.
@@ -38,8 +55,9 @@ class MPMSolver:
     Every particle has the volume prod(size)/P and the density rho. Gradients pass to all five tensors, which may be
     float32 or float64.
 
-    The solver counts its own `time`, at which conditions act. A call that `torch.utils.checkpoint` recomputes uses the
-    time of the first call, and does not change that of the solver.
+    The solver counts its own `time`, at which conditions act; within a call it is that at the start of the step. A call
+    that `torch.utils.checkpoint` recomputes uses the time of the first call, and does not change that of the solver.
+    `dt`, `damping`, `clip_bound` [m], `vol` and `p_mass` may be assigned.
 
     Args:
         init_pos: positions [P, 3] [m] by which boundary conditions select particles; without gradient.
@@ -84,10 +102,10 @@ class MPMSolver:
         self.device = self.init_pos.device
         self.n_particles = len(init_pos)
         self.num_grids = check_count("num_grids", num_grids, 1)
-        self.dt = float(check_number("dt", dt, "positive and finite", lambda v: 0 < v < math.inf))
+        self.dt = float(check_number("dt", dt, *POSITIVE))
         self.dx, self.inv_dx = 1 / num_grids, float(num_grids)
         self.clip_bound = self.dx * check_number("clip_bound", clip_bound, "not negative", lambda v: v >= 0)
-        self.damping = check_number("damping", damping, "between 0 and 1", lambda v: 0 <= v <= 1)
+        self.damping = damping
         self.vol: Any = math.prod(float(s) for s in size) / max(self.n_particles, 1)
         self.p_mass = rho * self.vol
         self.time = 0.0
@@ -102,6 +120,14 @@ class MPMSolver:
         self._changes = 0  # Lengths of the lists of conditions.
         self._last: tuple[Any, ...] | None = None  # Arguments of the last call.
         self._nodes: tuple[Tensor, Tensor] | None = None  # Of the last call, where they are known.
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name in ("vol", "p_mass") and isinstance(value, Tensor):
+            if is_readable(value) and not all(map(NUMBERS[name].holds, value.detach().reshape(-1).tolist())):
+                raise ValueError(f"{name} must be {NUMBERS[name].expected}, got a tensor with other values")
+        elif name in NUMBERS:
+            check_number(name, value, *NUMBERS[name])
+        super().__setattr__(name, value)
 
     def reset(self) -> None:
         """Set the time to zero."""
@@ -143,16 +169,27 @@ class MPMSolver:
             check_number("time", time)
         if not recomputed:
             self._times.store((x, v, C, F), (time, self._changes))
-            self.time = time + self.dt
         self.displacement, self._now = None, time
         self._last, self._nodes = (x, v, C, F, stress, time), None
-        result = self._steps(
-            *((x, v, C, F), stress, self._constants, time, self.dt, self._ended),
-            (self.clip_bound, self.vol, self.p_mass) if self._is_plain() else None,
-        )
+        with self._time_of_step(time, self.time if recomputed else time + self.dt):
+            result = self._steps(
+                *((x, v, C, F), stress, self._constants, time, self.dt, self._ended),
+                (self.clip_bound, self.vol, self.p_mass) if self._is_plain() else None,
+            )
         if recomputed:
             self._times.store(result, (time + self.dt, self._changes))
         return result
+
+    @contextmanager
+    def _time_of_step(self, start: float, after: float) -> Iterator[None]:
+        """Time of the solver during and after a step; a step that fails leaves it as it was."""
+        before, self.time = self.time, start
+        try:
+            yield
+        except BaseException:
+            self.time = before
+            raise
+        self.time = after
 
     def _is_plain(self) -> bool:
         """Whether nothing but damping acts on nodes and particles."""

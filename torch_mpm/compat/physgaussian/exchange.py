@@ -11,6 +11,12 @@ from ...errors import check_like
 from ...ops.svd import polar
 from ...state.state import State
 
+ARRAYS = {
+    **{"particle_x": "x", "particle_v": "v", "particle_C": "C", "particle_F": "F", "particle_F_trial": "F"},
+    **{"particle_vol": "volume", "particle_mass": "mass"},
+}
+"""Arrays of particles, by fields of the state."""
+
 
 class Exchange:
     """Imports and exports of the particles of a simulator, after its pending substeps."""
@@ -71,27 +77,29 @@ class Exchange:
         result: Tensor = self._exports[name]
         return result
 
-    def _import(self, name: str, value: Tensor | None, rows: tuple[int, ...]) -> None:
+    def _import(self, name: str, value: Tensor | None, rows: tuple[int, ...], clone: bool) -> None:
         if value is None:
             return
         state = self._flushed()
-        self._state = state.replace(**{name: value.to(state.x).reshape(len(state), *rows)})
+        values = value.to(state.x).reshape(len(state), *rows)
+        shared = clone and values.data_ptr() == value.data_ptr()
+        self._state = state.replace(**{name: values.clone() if shared else values})
 
     def import_particle_x_from_torch(self, tensor_x: Tensor | None, clone: bool = True, device: Any = None) -> None:
-        """Positions [P, 3] [m]. Gradients pass; given tensors are not written to."""
-        self._import("x", tensor_x, (3,))
+        """Positions [P, 3] [m], copied unless `clone` is False. Gradients pass; given tensors are not written to."""
+        self._import("x", tensor_x, (3,), clone)
 
     def import_particle_v_from_torch(self, tensor_v: Tensor | None, clone: bool = True, device: Any = None) -> None:
         """Velocities [P, 3] [m/s]."""
-        self._import("v", tensor_v, (3,))
+        self._import("v", tensor_v, (3,), clone)
 
     def import_particle_F_from_torch(self, tensor_F: Tensor | None, clone: bool = True, device: Any = None) -> None:
         """Deformation gradients, [P, 3, 3] or rows of nine."""
-        self._import("F", tensor_F, (3, 3))
+        self._import("F", tensor_F, (3, 3), clone)
 
     def import_particle_C_from_torch(self, tensor_C: Tensor | None, clone: bool = True, device: Any = None) -> None:
         """Affine velocity fields [1/s], [P, 3, 3] or rows of nine."""
-        self._import("C", tensor_C, (3, 3))
+        self._import("C", tensor_C, (3, 3), clone)
 
     def export_particle_x_to_torch(self) -> Tensor:
         """Positions [P, 3] [m]."""

@@ -118,8 +118,8 @@ class MPM_Simulator_WARP(Viewed):
         """Particles at rest, and a new simulation.
 
         Args:
-            tensor_x: positions [P, 3] [m] in [0, grid_lim].
-            tensor_volume: [P] [m³].
+            tensor_x: positions [P, 3] [m] in [0, grid_lim], copied.
+            tensor_volume: [P] [m³], copied.
             tensor_cov: covariance of a Gaussian on each particle, six numbers xx xy xz yy yz zz: [P, 6] or [6 P].
             n_grid, grid_lim, device: as for the class.
 
@@ -129,11 +129,11 @@ class MPM_Simulator_WARP(Viewed):
         if not isinstance(tensor_x, Tensor) or tensor_x.dim() != 2 or tensor_x.shape[1] != 3:
             raise ValueError(f"tensor_x must have shape [P, 3], got {shape_of(tensor_x)}")
         self.initialize(len(tensor_x), n_grid, grid_lim)
-        self._place(tensor_x.to(device=device), tensor_volume, tensor_cov)
+        self._place(tensor_x.to(device=device, copy=True), tensor_volume, tensor_cov)
 
     def _place(self, x: Tensor, volume: Tensor, cov: Tensor | None) -> None:
         """Particles at rest at positions [P, 3] [m], with volumes [P] [m³]."""
-        volume = volume.to(x)
+        volume = volume.to(x, copy=True)
         check_like("tensor_volume", volume, x, (len(x),), "[P]")
         for name, given, good, expected in (
             ("tensor_x", x, x.detach().isfinite().all(1), "finite"),

@@ -15,11 +15,14 @@ from ...errors import check_number
 from ...grid.grid import Grid
 from ...laws import Material
 from ...state.state import State
+from ...step.clocks import time_after
 from ...step.particle_operations import Timed
 from ...step.step import Step
 from ..clipping import ClippedRollout
+from ..pending import Versions, check_versions, versions
 from .condition_list import Nodes, acts, changes
 from .descendants import DescendantMethods
+from .exchange import ARRAYS
 from .law_choice import chosen_law, kinds_of, law_indices, needs_moduli
 from .particles import Anchored, affine_operations, enabled_operations, is_pic
 from .weighted_force import WeightedForceStep
@@ -57,7 +60,7 @@ class Substeps(DescendantMethods):
     @property
     def time(self) -> float:
         """[s]"""
-        return self._start_time + self._pending.steps * self._pending.dt
+        return float(time_after(self._start_time, self._pending.dt, self._pending.steps))
 
     @property
     def _start_time(self) -> float:
@@ -130,13 +133,14 @@ class Substeps(DescendantMethods):
 
     _anchored: Anchored | None = None
     _law_codes: tuple[Tensor | None, int | None] = (None, None)
-    _versions: dict[str, int | None]
+    _versions: Versions
 
-    def _tensor_versions(self) -> dict[str, int | None]:
-        """Versions of the tensors that substeps read, which grow with each write in place."""
-        tensors = {**self.parameters, **{f"mpm_state.{name}": t for name, t in self._selections.items()}}
-        tensors["mpm_state.particle_material"] = self._codes
-        return {name: version(t) for name, t in tensors.items() if isinstance(t, Tensor)}
+    def _tensor_versions(self) -> Versions:
+        """Versions of the tensors that substeps read."""
+        state = self._loaded()
+        of_particles = {name: getattr(state, field) for name, field in ARRAYS.items()} | self._selections
+        of_particles |= {"particle_material": self._codes, **state.extra}
+        return versions(self.parameters | {f"mpm_state.{name}": value for name, value in of_particles.items()})
 
     def _codes_have_changed(self) -> bool:
         """Whether materials of particles were written to in place since the law was chosen."""
@@ -166,13 +170,7 @@ class Substeps(DescendantMethods):
         (steps, dt, grad, flip), self._pending = self._pending, Pending()
         if steps == 0:
             return
-        now = self._tensor_versions()
-        for name, before in self._versions.items():
-            if now.get(name) != before:
-                raise RuntimeError(
-                    f"{name} must not be written to while {steps} substeps are pending, which would be computed with "
-                    "the new values: read a result, or assign a new tensor"
-                )
+        check_versions(self._versions, self._tensor_versions(), steps)
         began = time.perf_counter()
         with torch.set_grad_enabled(grad):
             self._check_ready()

@@ -14,16 +14,12 @@ from ..constitutive import engineering, lame
 from ..keys import nearest
 from ..selections import chosen
 from .dialects import code_of, material_of
+from .exchange import ARRAYS
 from .substeps import Substeps
 
 if TYPE_CHECKING:
     from .simulator import MPM_Simulator_WARP
 
-ARRAYS = {
-    **{"particle_x": "x", "particle_v": "v", "particle_C": "C", "particle_F": "F", "particle_F_trial": "F"},
-    **{"particle_vol": "volume", "particle_mass": "mass"},
-}
-"""Arrays of particles, by fields of the state."""
 GRIDS = ("grid_m", "grid_v_in", "grid_v_out")
 
 

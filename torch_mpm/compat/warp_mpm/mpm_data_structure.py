@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import torch
@@ -55,6 +55,11 @@ class _Struct:
     def wait_for(self, pending: Callable[[], None] | None) -> None:
         """Set the function that computes pending substeps."""
         self.__dict__["_pending"] = pending
+
+    def values(self) -> Iterable[tuple[str, Any]]:
+        """Names and values as they are, without the pending substeps."""
+        values: dict[str, Any] = self._values
+        return values.items()
 
     def known(self, name: str) -> bool:
         """Whether a value is known."""

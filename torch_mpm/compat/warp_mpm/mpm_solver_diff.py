@@ -14,8 +14,10 @@ from ...cuda_graphs.capture import version
 from ...errors import check_count, check_flag, check_number, shape_of
 from ...grid.grid import Grid
 from ...state.state import State
+from ...step.clocks import time_after
 from ..clipping import ClippedRollout
 from ..keys import check_keys
+from ..pending import Versions, check_versions, versions
 from ..physgaussian.condition_list import Nodes, acts, changes
 from ..physgaussian.dialects import BASE_KEYS, DIALECTS, code_of, material_of
 from ..physgaussian.law_choice import chosen_law
@@ -143,8 +145,10 @@ class MPMWARPDiff(ParticleConditions):
     @property
     def time(self) -> float:
         """[s]"""
-        pending = 0.0 if self._queue is None else self._queue[2] * self._queue[3]
-        return self._time + pending
+        if self._queue is None:
+            return self._time
+        _, _, n, dt, _ = self._queue
+        return float(time_after(self._time, dt, n))
 
     @time.setter
     def time(self, value: float) -> None:
@@ -218,6 +222,7 @@ class MPMWARPDiff(ParticleConditions):
         mpm_model.settle()
         mpm_state.settle()
         self._queue = mpm_model, mpm_state, 1, dt, torch.is_grad_enabled()
+        self._versions = _versions_of(mpm_model, mpm_state)
         for struct in (mpm_model, mpm_state):
             struct.wait_for(self._before_change)
 
@@ -228,6 +233,7 @@ class MPMWARPDiff(ParticleConditions):
         (model, state, n, dt, grad), self._queue = self._queue, None
         for struct in (model, state):
             struct.wait_for(None)
+        check_versions(self._versions, _versions_of(model, state), n)
         with torch.set_grad_enabled(grad):
             self.rollout(model, state, state, n, dt)
 
@@ -280,6 +286,11 @@ class MPMWARPDiff(ParticleConditions):
 
     def _nodes(self, model: MPMModelStruct, x: Tensor) -> Nodes:
         return Nodes(model.dx, (model.n_grid,) * 3, x[:0], self.strict)
+
+
+def _versions_of(model: MPMModelStruct, state: MPMStateStruct) -> Versions:
+    """Versions of the tensors of structs."""
+    return versions({f"mpm_model.{k}": v for k, v in model.values()} | {f"mpm_state.{k}": v for k, v in state.values()})
 
 
 def _check_structs(model: MPMModelStruct, **states: MPMStateStruct) -> None:
