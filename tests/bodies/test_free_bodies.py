@@ -136,7 +136,7 @@ def test_a_driven_body_is_an_obstacle_that_moves(dim, device):
     assert float(end.v.abs().max()) > 0.1
 
 
-def test_a_hinge_keeps_its_distance_and_takes_the_moment(device):
+def test_a_hinge_keeps_its_distance_and_its_energy(device):
     """A pendulum of a disc: the anchor stays where it is; in gravity alone its energy stays to the order of dt."""
     step, state = material(2, device, gravity=(0.0, -9.8))
     anchor, length = (0.3, 1.6), 0.3

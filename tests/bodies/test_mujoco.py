@@ -58,6 +58,7 @@ def test_momentum_of_material_and_body_is_kept(exchanges):
     assert float((total() - before).abs().max()) < 1e-12 * met
 
 
+@pytest.mark.thorough(exchanges=3)
 @pytest.mark.parametrize("exchanges", [1, 3])
 def test_a_body_comes_to_rest_on_a_block(exchanges):
     """Carried with its weight."""

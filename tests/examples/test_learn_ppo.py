@@ -41,6 +41,7 @@ def test_files_are_read_as_tensors_only(learn_ppo, tmp_path):
         learn_ppo.load("push", tmp_path / "push.pt")
 
 
+@pytest.mark.thorough
 def test_a_seed_determines_the_training(learn_ppo):
     training = learn_ppo.Training(240, 2, 40)
     first, again, other = (learn_ppo.train("push", training, seed) for seed in (3, 3, 4))
