@@ -228,6 +228,7 @@ def test_planes_and_errors_of_geoms():
         ({"bodies": [1]}, ValueError, "got 1"),
         ({"bodies": ["body", "body"]}, ValueError, r"bodies must be different, got \['body', 'body'\]"),
         ({"bodies": "body"}, TypeError, "bodies must be a list of names, got str"),
+        ({"bodies": []}, ValueError, "bodies must have at least one name"),
         ({"bodies": ["world"]}, ValueError, "bodies must have a colliding geom each, got 'world' without one"),
         ({"geoms": ["palm"]}, ValueError, r"geoms must be colliding geoms of the bodies, \['geom'\], got 'palm'"),
         ({"kind": "glue"}, ValueError, "kind must be one of"),

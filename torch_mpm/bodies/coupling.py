@@ -113,6 +113,8 @@ class MujocoCoupling:
         for name, names in (("bodies", bodies), ("geoms", geoms)):
             if names is not None and (isinstance(names, str) or not isinstance(names, Sequence)):
                 raise TypeError(f"{name} must be a list of names, got {shape_of(names)}")
+        if len(bodies) == 0:
+            raise ValueError("bodies must have at least one name, got none")
         if len(set(bodies)) < len(bodies):
             raise ValueError(f"bodies must be different, got {list(bodies)}")
         self.substeps = None if substeps is None else check_count("substeps", substeps, 1)
