@@ -134,7 +134,7 @@ def measure_run(made: Scene, degree: int, frames: int, device: str, folder: Path
 
 
 def seconds_of_writing(data: bytes, paths: Sequence[Path], threads: int) -> float:
-    """Seconds in which threads write files of the same bytes, each of which appears when it is on the disk."""
+    """Time in which threads write whole files of the same bytes to the disk [s]."""
 
     def write(path: Path) -> None:
         with replacing(path) as temporary:

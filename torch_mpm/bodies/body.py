@@ -11,7 +11,7 @@ from torch import Tensor
 from ..boundaries.obstacles import Obstacle
 from ..errors import check_number, check_vector, shape_of
 from ..geometry.values import filled
-from .exchange import Part, parts_of, swirl
+from .exchange import VELOCITY, Part, parts_of, swirl
 
 
 class Joint:
@@ -70,7 +70,8 @@ class Slider(Joint):
             raise ValueError(f"slider must have an axis of {dim} numbers, got {self.axis}")
 
     def directions(self, position: Tensor) -> Tensor | None:
-        way = [*self.axis, *[0.0] * (1 if len(self.axis) == 2 else 3)]
+        dim = len(self.axis)
+        way = [*self.axis, *[0.0] * (VELOCITY[dim] - dim)]
         return filled(way, position).expand(len(position), -1)[..., None]
 
 
@@ -78,8 +79,7 @@ class Driven(Joint):
     """No motion but the velocity that the body is given: nothing pushes it."""
 
     def directions(self, position: Tensor) -> Tensor | None:
-        dim = position.shape[1]
-        return position.new_zeros(len(position), dim + (1 if dim == 2 else 3), 0)
+        return position.new_zeros(len(position), VELOCITY[position.shape[1]], 0)
 
 
 class Body:
@@ -127,7 +127,7 @@ class Body:
     def mass_matrix(self, turn: Tensor) -> Tensor:
         """Mass and inertia [B, n, n] by the rotation of the frame [B, D, D], n = 3 in 2-D and 6 in 3-D."""
         count, dim = turn.shape[:2]
-        matrix = turn.new_zeros(count, *(dim + (1 if dim == 2 else 3),) * 2)
+        matrix = turn.new_zeros(count, VELOCITY[dim], VELOCITY[dim])
         matrix[:, range(dim), range(dim)] = self.mass
         if dim == 2:
             matrix[:, 2, 2] = self.inertia[0]

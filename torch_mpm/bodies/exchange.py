@@ -229,10 +229,18 @@ def check_bodies(bodies: Any, state: State, grid: Grid, count: int) -> None:
 
 def motion_of(bodies: Tensor, dim: int) -> Motion:
     """Poses and velocities [B, K, 13] (3-D) or [B, K, 6] (2-D) by their parts."""
-    if dim == 2:
-        return Motion(bodies[..., :2], bodies[..., 2], bodies[..., 3:5], bodies[..., 5])
-    turn = rotation_vector(bodies[..., 3:4], bodies[..., 4:7])
-    return Motion(bodies[..., :3], turn, bodies[..., 7:10], bodies[..., 10:])
+    spin = bodies[..., POSE[dim] + dim :]
+    return Motion(
+        bodies[..., :dim],
+        rotation_of(bodies, dim),
+        bodies[..., POSE[dim] : POSE[dim] + dim],
+        spin[..., 0] if dim == 2 else spin,
+    )
+
+
+def rotation_of(poses: Tensor, dim: int) -> Tensor:
+    """Rotations of poses [..., 3 or 7], with or without further columns: angles [...] or rotation vectors [..., 3]."""
+    return poses[..., 2] if dim == 2 else rotation_vector(poses[..., 3:4], poses[..., 4:7])
 
 
 def with_velocities(poses: Tensor, later: Tensor, seconds: float) -> Tensor:
@@ -317,15 +325,23 @@ class Frames(NamedTuple):
         turn = torch.tensor([zero if part.rotation is None else part.rotation for part in flat], dtype=torch.float64)
         return Frames(owner, position.reshape(-1, dim), turn.reshape(-1, *(3,) * (dim - 2)))
 
+    def to(self, device: torch.device) -> Frames:
+        """The same on a device."""
+        return Frames(*(values.to(device, non_blocking=True) for values in self))
+
+    def arms(self, rotation: Tensor) -> Tensor:
+        """Vectors from the positions of the bodies to the centres of the obstacles [B, O, D] [m], by the rotations of
+        the bodies [B, K] or [B, K, 3]."""
+        turn = rotation_matrix(rotation[:, self.owner], self.position.shape[1])
+        return (turn @ self.position[..., None])[..., 0]
+
     def motion(self, of_bodies: Motion) -> Motion:
         """Motion of the obstacles [B, O, ...] by that of their bodies [B, K, ...]."""
-        device, dim = of_bodies.position.device, self.position.shape[1]
-        owner, position, rotation = (values.to(device, non_blocking=True) for values in self)
-        motion = Motion(*(values[:, owner] for values in of_bodies))
-        arm = (rotation_matrix(motion.rotation, dim) @ position[..., None])[..., 0]
+        frames = self.to(of_bodies.position.device)
+        motion, arm = Motion(*(values[:, frames.owner] for values in of_bodies)), frames.arms(of_bodies.rotation)
         return Motion(
             motion.position + arm,
-            _turned(motion.rotation, rotation.expand_as(motion.rotation)),
+            _turned(motion.rotation, frames.rotation.expand_as(motion.rotation)),
             motion.velocity + swirl(motion.angular_velocity, arm),
             motion.angular_velocity,
         )

@@ -28,10 +28,11 @@ from ..geometry.values import filled
 from ..grid.grid import Blocks
 from ..ops.autograd import dispatch, graph_at_once
 from ..ops.contact import MAX_OBSTACLES, fusible, obstacle_arguments, packed_rows, walls_beside
+from ..ops.impulses import with_moment
 from ..state.state import State, check_state
 from ..step.step import Step
 from .body import Body, Driven, Joint, mobility
-from .exchange import POSE, VELOCITY, Frames, Motion, assign, check_bodies, motion_of, moved, swirl
+from .exchange import POSE, VELOCITY, Frames, Motion, assign, check_bodies, motion_of, moved, rotation_of, swirl
 
 MAX_ITERATIONS = 20
 """Iterations of Newton's method where the host reads the residual."""
@@ -59,7 +60,7 @@ class BodyReport(NamedTuple):
 
 
 class FreeBodies:
-    """Rigid bodies that move each other and the material, in every scene of a batch.
+    """Rigid bodies and material that move each other, in every scene of a batch.
 
     Bodies act after the boundaries of the step, all of them as one solid. They do not collide with each other, nor with
     walls or obstacles: that is left to simulators of rigid bodies (`torch_mpm.couple`).
@@ -130,14 +131,15 @@ class FreeBodies:
                 "free bodies differentiate the contact of the nodes: use torch.no_grad() in place of inference_mode, "
                 "and torch.autograd in place of torch.func"
             )
-        self._check_joints(bodies)
         if self.step.on_grid is not None:
             raise ValueError("a step with bodies must have no on_grid of its own")
         now = bodies.double()
         worst = now.new_zeros(now.shape[:2])
         most = 0
-        for _ in range(n):
+        for k in range(n):
             solution = _Solution(self, now, dt, wrenches)
+            if k == 0:
+                solution.check_joints()
             self.step.on_grid = solution
             try:
                 state = self.step(state, dt)
@@ -177,19 +179,6 @@ class FreeBodies:
                 "cause, or a dt that is too large"
             )
 
-    def _check_joints(self, bodies: Tensor) -> None:
-        """Refuse velocities that a joint does not allow, where they can be read."""
-        if not is_readable(bodies) or all(type(body.joint) in (Joint, Driven) for body in self.bodies):
-            return
-        solution = _Solution(self, bodies.detach().double(), 1.0, None)
-        own = solution.begin[..., POSE[self.step.grid.dim] :]
-        allowed = (solution.mobility @ solution.mass @ own[..., None])[..., 0]
-        wrong = solution.size_of(own - allowed) > NOT_ALLOWED * solution.size_of(own)
-        for k, body in enumerate(self.bodies):
-            if not isinstance(body.joint, Driven) and bool(wrong[:, k].any()):
-                kind = type(body.joint).__name__.lower()
-                raise ValueError(f"bodies must have velocities that their joints allow, and body {k} is on a {kind}")
-
     def gravity_like(self, rows: Tensor) -> Tensor:
         """Gravity in the dtype of rows, [D] or [B, 1, D]."""
         dim = self.step.grid.dim
@@ -228,7 +217,20 @@ class _Solution:
         force[..., : self.dim] = masses[:, None] * self.of.gravity_like(self.begin)
         if wrenches is not None:
             force = force + wrenches.double()
-        return velocity + self.dt * (self.mobility @ force[..., None])[..., 0]
+        return velocity + self.dt * self._applied(force)
+
+    def check_joints(self) -> None:
+        """Raise ValueError for velocities at the beginning that a joint does not allow, where they can be read."""
+        bodies = self.of.bodies
+        if not is_readable(self.begin) or all(type(body.joint) in (Joint, Driven) for body in bodies):
+            return
+        own = self.begin[..., POSE[self.dim] :].detach()
+        allowed = self._applied((self.mass @ own[..., None])[..., 0])
+        wrong = self.size_of(own - allowed) > NOT_ALLOWED * self.size_of(own)
+        for k, body in enumerate(bodies):
+            if not isinstance(body.joint, Driven) and bool(wrong[:, k].any()):
+                kind = type(body.joint).__name__.lower()
+                raise ValueError(f"bodies must have velocities that their joints allow, and body {k} is on a {kind}")
 
     def __call__(self, blocks: Blocks, velocity: Tensor, mass: Tensor, dt: Any) -> Tensor:
         """Node velocities after contact with the bodies, whose rows at the end of the step are then known."""
@@ -262,7 +264,7 @@ class _Solution:
             applied = (self.mobility.detach() @ by_body).flatten(1, 2)
             return torch.eye(applied.shape[1], dtype=p.dtype, device=p.device) - applied
 
-        return U - self.predicted.detach() - self._applied(p.detach()).detach(), derivative
+        return U - self.predicted - self._applied(p), derivative
 
     def size_of(self, velocities: Tensor) -> Tensor:
         """Speeds [B, K] of velocities [B, K, n]; of rotation that at the radius of gyration."""
@@ -284,7 +286,8 @@ class _Solution:
             self.iterations += 1
             jacobian = derivative()
             # Velocities are rounded to the dtype of the nodes, whose impulses change accordingly.
-            rounded = torch.finfo(dtype).eps * (jacobian - torch.eye(jacobian.shape[1]).to(jacobian)).norm(dim=(1, 2))
+            eye = torch.eye(jacobian.shape[1], dtype=U.dtype, device=U.device)
+            rounded = torch.finfo(dtype).eps * (jacobian - eye).norm(dim=(1, 2))
             scale = torch.maximum(scale, (rounded[:, None] * self.size_of(U)) / TOLERANCE[dtype])
             step = torch.linalg.solve_ex(jacobian, residual.flatten(1))[0].view_as(U)
             trial = U - share[:, None, None] * step
@@ -332,8 +335,7 @@ class _Solution:
 
 def _rotations(pose: Tensor, dim: int) -> Tensor:
     """Rotation matrices [B, D, D] of poses [B, 7] or [B, 3]."""
-    rows = torch.cat([pose, pose.new_zeros(len(pose), VELOCITY[dim])], 1)[:, None]
-    return rotation_matrix(motion_of(rows, dim).rotation, dim)[:, 0]
+    return rotation_matrix(rotation_of(pose, dim), dim)
 
 
 def _spin(body: Body, pose: Tensor, momentum: Tensor) -> Tensor:
@@ -374,12 +376,14 @@ class _BodyContact:
     """Contact of the nodes with the obstacles of bodies, whose poses are known, by the velocities of the bodies."""
 
     def __init__(self, bodies: FreeBodies, motion: Motion, blocks: Blocks, velocity: Tensor, mass: Tensor) -> None:
-        self.bodies, self.motion, self.velocity, self.mass = bodies, motion, packed_rows(velocity), mass
+        self.velocity, self.mass = packed_rows(velocity), mass
         grid, self.dim = blocks.grid, blocks.grid.dim
+        frames = bodies.frames.to(velocity.device)
+        self.owner, self.arm, self.centre = frames.owner, frames.arms(motion.rotation), motion.position
         still = motion._replace(
             velocity=torch.zeros_like(motion.velocity), angular_velocity=torch.zeros_like(motion.angular_velocity)
         )
-        assign(bodies.obstacles, bodies.frames.motion(still), 0.0)
+        assign(bodies.obstacles, frames.motion(still), 0.0)
         table, *self.kinds = obstacle_arguments(bodies.obstacles, self.velocity, grid.scenes)
         self.table = table.expand(grid.scenes, -1, -1)
         self.place = (None, 0.0, *blocks.packed, *walls_beside(bodies.step.walls, grid))
@@ -387,8 +391,8 @@ class _BodyContact:
     def detached(self) -> _BodyContact:
         """The same without gradients."""
         other = copy.copy(self)
-        other.motion = Motion(*(value.detach() for value in self.motion))
-        other.velocity, other.mass, other.table = self.velocity.detach(), self.mass.detach(), self.table.detach()
+        for name in ("velocity", "mass", "table", "arm", "centre"):
+            setattr(other, name, getattr(self, name).detach())
         return other
 
     def velocity_after(self, U: Tensor) -> Tensor:
@@ -403,28 +407,21 @@ class _BodyContact:
         on = dispatch(
             torch.ops.torch_mpm.contact_impulses, self.mass, self.velocity, self._rows(U), *self.kinds, *self.place
         )
-        owner = self.bodies.frames.owner.to(on.device)
-        on = on.new_zeros(on.shape[0], len(self.bodies), on.shape[2]).index_add(1, owner, on)
+        on = on.new_zeros(on.shape[0], U.shape[1], on.shape[2]).index_add(1, self.owner, on)
         linear, angular = on[..., : self.dim], on[..., self.dim :]
-        return torch.cat([linear, angular - _moment(self.motion.position, linear)], 2)
+        moment = with_moment(self.centre, linear)[..., self.dim :]
+        return torch.cat([linear, angular - moment], 2)
 
     def _rows(self, U: Tensor) -> Tensor:
         """The table of the obstacles with their velocities."""
-        D, turning = self.dim, U[..., 2] if self.dim == 2 else U[..., 3:]
-        moves = self.bodies.frames.motion(self.motion._replace(velocity=U[..., :D], angular_velocity=turning))
-        spin = moves.angular_velocity.reshape(*moves.velocity.shape[:2], -1)
-        velocity, spin = (value.to(self.table.dtype) for value in (moves.velocity, spin))
+        D, own = self.dim, U[:, self.owner]
+        spin = own[..., D:]
+        velocity = own[..., :D] + swirl(spin[..., 0] if D == 2 else spin, self.arm)
+        velocity, spin = (value.to(self.table.dtype) for value in (velocity, spin))
         place, _, rotation, _, rest = self.table.split(
             [1 + D, D, spin.shape[2], spin.shape[2], self.table.shape[2] - 1 - 2 * D - 2 * spin.shape[2]], 2
         )
         return torch.cat([place, velocity, rotation, spin, rest], 2)
-
-
-def _moment(arm: Tensor, force: Tensor) -> Tensor:
-    """Moments [B, K, 1 or 3] of forces at the end of arms [B, K, D]."""
-    if arm.shape[-1] == 3:
-        return torch.linalg.cross(arm, force)
-    return (arm[..., 0] * force[..., 1] - arm[..., 1] * force[..., 0])[..., None]
 
 
 def _check_obstacle(k: int, obstacle: Any, known: set[int]) -> None:

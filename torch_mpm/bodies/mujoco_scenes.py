@@ -21,7 +21,7 @@ Two threads gain from about this number on. With fewer, their start and the copi
 
 
 class MujocoScenes:
-    """MjData of B scenes of a model, of which K bodies take wrenches.
+    """MjData of B scenes of a model. Wrenches act on K of its bodies.
 
     Args:
         model: MjModel.

@@ -10,7 +10,7 @@ import numpy as np
 from ..geometry.surface_mesh import Array
 
 HEADER, TRIANGLE = 84, 50
-"""Bytes before the triangles of a binary file, the last four of which are their number, and of a triangle."""
+"""Sizes in a binary file [bytes]: of the part before the triangles, which ends with their number, and of a triangle."""
 BEGINNING = 1000
 """Bytes in which a binary file has a zero: the number of triangles has one below 2^24 of them."""
 
