@@ -526,7 +526,7 @@ __global__ void __launch_bounds__(kThreads)
     activate_at_once(const ActivateArguments<T, D> a, const Workspace w, int table, int64_t rows) {
   grid_dependency_sync();
   const int64_t start = int64_t(blockIdx.x) * kThreads + threadIdx.x, stride = int64_t(gridDim.x) * kThreads;
-  if (a.displacement && !a.fresh && a.displacement->lasts(a.particles)) {
+  if (a.displacement && !a.fresh && a.displacement->lasts(a.particles, a.out_of_block_cost)) {
     for (int64_t row = start; row <= a.scenes; row += stride) {
       int* const status = a.status + row * kStatusSize;
       copy_status(a.previous_status + row * kStatusSize, status);

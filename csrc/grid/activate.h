@@ -36,8 +36,9 @@ struct ActivateArguments {
   bool fresh = true;          // whether the table and the workspace are new, not those of an earlier call
   int64_t workspace_size = 0;
   const Displacement* displacement = nullptr;  // since the activation in these tensors; null to force a new one
-  int most_of_item = 0;                        // on CUDA: particles of an item; 0 for the default
-  const Displacement* missed = nullptr;        // states whether the previous step may have missed a particle
+  int out_of_block_cost = kOutOfBlockCost;
+  int most_of_item = 0;                  // on CUDA: particles of an item; 0 for the default
+  const Displacement* missed = nullptr;  // states whether the previous step may have missed a particle
   Displacement* next_displacement =
       nullptr;  // kLost if there is no room for all blocks around those with particles; or null
 

@@ -21,8 +21,9 @@ struct Topology {
   int64_t schedule_size = 0;
 };
 
-// Cost of a particle out of its block, as a multiple of that of activating one particle, on CUDA.
-constexpr int kOutOfBlockCost = 2;
+// Cost of a particle out of its block in a step, as a multiple of that of activating one particle, on CUDA: of a step,
+// and of one with heat, which has more kernels.
+constexpr int kOutOfBlockCost = 2, kOutOfBlockCostWithHeat = 8;
 
 // Counters of the displacement of particles since their activation, which on CUDA may serve several steps.
 struct Displacement {
@@ -39,7 +40,9 @@ struct Displacement {
   MPM_HD bool lasts(int64_t particles, int out_of_block_cost = kOutOfBlockCost) const {
     return lost == 0 && (int64_t(earlier) + out_of_block) * out_of_block_cost <= particles;
   }
-  MPM_HD Displacement next(int64_t particles) const { return {0, 0, lasts(particles) ? earlier + out_of_block : 0}; }
+  MPM_HD Displacement next(int64_t particles, int out_of_block_cost) const {
+    return {0, 0, lasts(particles, out_of_block_cost) ? earlier + out_of_block : 0};
+  }
 };
 
 // Entries of the schedule tensor: room for the work items of both backends, with the number of particles of each cell,

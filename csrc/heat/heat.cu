@@ -54,7 +54,7 @@ struct HeatWorkspace {
     char* const base = static_cast<char*>(memory);
     const auto take = [&](int64_t bytes) {
       char* p = base + size;
-      size += (bytes + 255) / 256 * 256;
+      size += align_workspace(bytes);
       return p;
     };
     const int64_t nodes = t.max_blocks * int64_t(kBlockNodes<D>);
@@ -106,11 +106,14 @@ struct HeatKernel {
   HeatKernel(const HeatArguments<T, D>& a, bool small)
       : a(a), w(a.topology, a.workspace, small), x(a.x), conductance(a.conductance) {}
 
-  // Whether the scene is solved here, and not by a single thread block.
-  __device__ bool takes(int scene) const { return !w.apart.left || w.apart.left[scene]; }
+  // Whether the scene is solved here, and not by a single thread block, nor by other kernels.
+  __device__ bool takes(int scene) const {
+    if (a.leaves_simple && simple_steps(a, scene) > 0) return false;
+    return !w.apart.left || w.apart.left[scene];
+  }
   __device__ bool takes_any() const {
-    bool any = !w.apart.left;
-    for (int scene = threadIdx.x; scene < a.topology.scenes && !any; scene += blockDim.x) any = w.apart.left[scene];
+    bool any = false;
+    for (int scene = threadIdx.x; scene < a.topology.scenes && !any; scene += blockDim.x) any = takes(scene);
     return __syncthreads_or(any);
   }
 
@@ -144,8 +147,7 @@ struct HeatKernel {
     };
     const auto slot = [&](int s) {
       if (s == 0) return 0;
-      return entries_below(a.topology.max_blocks,
-                           [&](int i) { return a.topology.block[i] >= 0 && scene_of_slot(i) < s; });
+      return entries_below(near_blocks(a), [&](int i) { return a.topology.block[i] >= 0 && scene_of_slot(i) < s; });
     };
     r.item = item(scene);
     r.item_end = item(scene + 1);
@@ -216,7 +218,8 @@ struct HeatKernel {
         if (!wanted(scene)) continue;
         Curvature sum{0};
         for_items(a.topology, item + threadIdx.x / 32, end, blockDim.x / 32, colour, [&](int number, int end) {
-          const T power = sum_items<Sum, S>(a.topology, w.packed, number, end, u, out, a.deterministic, memory);
+          const T power =
+              sum_items<Sum, S>(a.topology, w.packed, number, end, StoredValues<T>{u}, out, a.deterministic, memory);
           if (lane_index() == 0) sum.value += double(power);
         });
         if (Sum != HeatSum::product) continue;

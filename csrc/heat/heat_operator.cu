@@ -13,7 +13,7 @@ PackedItems<T, D> lay_out(const Topology<T, D>& t, void* memory, int64_t& size) 
   size = 0;
   packed.lay_out(t, [&](int64_t bytes) {
     char* p = static_cast<char*>(memory) + size;
-    size += (bytes + 255) / 256 * 256;
+    size += align_workspace(bytes);
     return p;
   });
   return packed;
@@ -31,9 +31,11 @@ __global__ void __launch_bounds__(kOperatorThreads)
   for_items(a.topology, colour, [&](int number, int end) {
     for (int i = number; i < end; i++) pack_item<S>(a.topology, x, conductance, items[i], i, packed, own);
     if (a.nodes)
-      sum_items<HeatSum::product, S>(a.topology, packed, number, end, a.nodes, a.sum, colour >= 0, own);
+      sum_items<HeatSum::product, S>(a.topology, packed, number, end, StoredValues<T>{a.nodes}, a.sum, colour >= 0,
+                                     own);
     else
-      sum_items<HeatSum::diagonal, S>(a.topology, packed, number, end, a.nodes, a.sum, colour >= 0, own);
+      sum_items<HeatSum::diagonal, S>(a.topology, packed, number, end, StoredValues<T>{a.nodes}, a.sum, colour >= 0,
+                                      own);
   });
 }
 

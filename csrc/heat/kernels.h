@@ -4,6 +4,7 @@
 #include "heat/patches.h"
 #include "heat/solve.h"
 #include "heat/transfer.h"
+#include "transfer/advance.h"
 
 #define MPM_HEAT_KERNELS(PLAIN, ORDERED, SIZE)         \
   SIZE(heat_workspace, HeatArguments)                  \
@@ -28,3 +29,13 @@ MPM_BACKEND_KERNELS(MPM_HEAT_KERNELS)
   PLAIN(heat_count, HeatCountArguments)                 \
   ORDERED(heat_to_particles, HeatToParticlesArguments)
 MPM_BACKEND_KERNELS(MPM_HEAT_TRANSFER_KERNELS)
+
+// On CUDA alone.
+#define MPM_HEAT_SIMPLE_KERNELS(PLAIN, ORDERED, SIZE) \
+  ORDERED(heat_g2p_advance, HeatAdvanceArguments)     \
+  ORDERED(heat_exchange, ScatterArguments)            \
+  ORDERED(heat_simple_step, HeatSimpleArguments)      \
+  PLAIN(heat_finish, HeatFinishArguments)
+#if MPM_BACKEND == MPM_BACKEND_IS_cuda
+MPM_BACKEND_KERNELS(MPM_HEAT_SIMPLE_KERNELS)
+#endif

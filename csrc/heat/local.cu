@@ -2,6 +2,7 @@
 
 #include "cuda/for_each.cuh"
 #include "heat/kernels.h"
+#include "heat/largest.cuh"
 
 // Steps of heat at single nodes, particles and scenes, and boundaries of heat.
 namespace mpm::cuda {
@@ -21,7 +22,7 @@ MPM_HD int scene_of_node(const Topology<T, D>& t, int64_t node, int (&corner)[D]
 }
 
 template <class T, int D>
-int64_t nodes_of(const Topology<T, D>& t) {
+MPM_HD int64_t nodes_of(const Topology<T, D>& t) {
   return int64_t(t.max_blocks) * kBlockNodes<D>;
 }
 
@@ -31,6 +32,12 @@ MPM_HD void at_node(const Arguments& a, int64_t i) {
   int corner[D];
   const int scene = scene_of_node(a.topology, i, corner);
   if (scene >= 0) work(a, scene, i);
+}
+
+__host__ __device__ inline void request_activation([[maybe_unused]] Displacement* displacement) {
+#ifdef __CUDA_ARCH__
+  atomicOr(&displacement->lost, Displacement::kLost);
+#endif
 }
 
 template <class T, int D>
@@ -48,24 +55,19 @@ MPM_HD void layer(const HeatLayersArguments<T, D>& a, int64_t p) {
   heat_layer_of(a, pose_of(a.contact, a.obstacle, scene_of_particle(a, p)), p);
 }
 
-// Values that are not negative are ordered like their bits, and NaN is above them.
 template <class T, int D>
 __global__ void __launch_bounds__(kThreads) largest_kernel(const __grid_constant__ HeatLargestArguments<T, D> a) {
   grid_dependency_sync();
-  const auto raise = [&](int64_t scene, long long wanted) {
-    auto* const bits = reinterpret_cast<long long*>(a.largest + scene * a.stride);
-    if (*const_cast<volatile long long*>(bits) < wanted) atomicMax(bits, wanted);
-  };
+  const auto raise_scene = [&](int64_t scene, long long wanted) { raise(a.largest + scene * a.stride, wanted); };
   int64_t scene = -1;
   long long largest = 0;
   const int64_t stride = int64_t(gridDim.x) * kThreads;
   for (int64_t p = int64_t(blockIdx.x) * kThreads + threadIdx.x; p < a.particles; p += stride) {
     const int64_t given = a.scene.pointer ? a.scene.pointer[p * a.scene.stride[0]] : 0;
     const int64_t own = given < 0 ? 0 : given < a.scenes ? given : a.scenes - 1;
-    if (own != scene && largest > 0) raise(scene, largest);
+    if (own != scene && largest > 0) raise_scene(scene, largest);
     if (own != scene) scene = own, largest = 0;
-    const double value = double(a.value.pointer[p * a.value.stride[0]]);
-    const long long bits = value == value ? __double_as_longlong(value) : LLONG_MAX;
+    const long long bits = ordered_bits(double(a.value.pointer[p * a.value.stride[0]]));
     if (bits > largest) largest = bits;
   }
   const int64_t first = __shfl_sync(~0u, scene, 0);  // a warp of one scene writes once
@@ -77,10 +79,46 @@ __global__ void __launch_bounds__(kThreads) largest_kernel(const __grid_constant
     }
     if (threadIdx.x % 32 != 0) return;
   }
-  if (largest > 0) raise(scene, largest);
+  if (largest > 0) raise_scene(scene, largest);
+}
+
+template <class T, int D>
+MPM_HD void mean_and_clear(const HeatMeansArguments<T, D>& a, int64_t i) {
+  heat_mean(a, i);
+  for (int64_t k = i; k < a.cleared_size; k += a.nodes) a.cleared[k] = T(0);
+}
+
+// Work at a scene: i < scenes.
+template <class T, int D>
+MPM_HD void finish_scene(const HeatFinishArguments<T, D>& a, int64_t scene) {
+  constexpr double kGrowth = 2;  // of the bound, within a substep
+  const HeatArguments<T, D>& solve = a.simple.solve;
+  const double bound = solve.bound_scale * solve.scene_bound[scene];
+  if (a.displacement && simple_steps_of(kGrowth * bound, solve.relative_tolerance) == 0)
+    request_activation(a.displacement);
+  if (simple_steps(solve, int(scene)) == 0)
+    count_solve(
+        HeatCountArguments<T, D>{solve.topology.scenes, solve.converged, solve.residual, solve.scene_dt, a.status},
+        scene);
+}
+
+template <class T, int D>
+MPM_HD void finish(const HeatFinishArguments<T, D>& a, int64_t i) {
+  const Topology<T, D>& t = a.simple.solve.topology;
+  if (i < t.scenes) finish_scene(a, i);
+  if (i >= nodes_of(t)) return;
+  int corner[D];
+  const int scene = scene_of_node(t, i, corner);
+  if (scene >= 0) finish_node(a, scene, i);
 }
 
 }  // namespace
+
+template <class T, int D>
+void heat_finish(const HeatFinishArguments<T, D>& a, Stream stream) {
+  const Topology<T, D>& t = a.simple.solve.topology;
+  for_each<finish<T, D>>(std::max<int64_t>(nodes_of(t), t.scenes), a, stream);
+}
 
 template <class T, int D>
 void heat_volumes(const HeatVolumesArguments<T, D>& a, Stream stream) {
@@ -89,7 +127,7 @@ void heat_volumes(const HeatVolumesArguments<T, D>& a, Stream stream) {
 
 template <class T, int D>
 void heat_means(const HeatMeansArguments<T, D>& a, Stream stream) {
-  for_each<heat_mean<T, D>>(a.nodes, a, stream);
+  for_each<mean_and_clear<T, D>>(a.nodes, a, stream);
 }
 
 template <class T, int D>
@@ -134,6 +172,7 @@ MPM_INSTANTIATE(heat_volumes, HeatVolumesArguments)
 MPM_INSTANTIATE(heat_means, HeatMeansArguments)
 MPM_INSTANTIATE(heat_increments, HeatIncrementsArguments)
 MPM_INSTANTIATE(heat_count, HeatCountArguments)
+MPM_INSTANTIATE(heat_finish, HeatFinishArguments)
 MPM_INSTANTIATE(heat_largest, HeatLargestArguments)
 MPM_INSTANTIATE(heat_hold, HeatHoldArguments)
 MPM_INSTANTIATE(heat_layers, HeatLayersArguments)

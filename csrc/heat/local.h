@@ -93,6 +93,18 @@ MPM_HD void heat_mean(const HeatMeansArguments<T, D>& a, int64_t i) {
 }
 
 template <class T, int D>
+MPM_HD void finish_node(const HeatFinishArguments<T, D>& a, int scene, int64_t i) {
+  const HeatArguments<T, D>& solve = a.simple.solve;
+  const int steps = simple_steps(solve, scene);
+  T increment = T(0);
+  if (steps > 0)
+    increment = simple_increment(a.simple, i, steps, step_of_scene(solve, scene));
+  else if (solve.heat_capacity[i] > T(0))  // the solver has no results of blocks without particles
+    increment = solve.increment[i];
+  a.sums[i * kHeatChannels + kHeatTheta] = increment + (solve.theta[i] - a.theta[i]);
+}
+
+template <class T, int D>
 MPM_HD void heat_increment(const HeatIncrementsArguments<T, D>& a, int64_t i) {
   a.sums[i * kHeatChannels + kHeatTheta] = a.increment[i] + (a.start[i] - a.theta[i]);
 }

@@ -35,6 +35,21 @@ __device__ P load_once(const P* p) {
   return q;
 }
 
+// The packed order of an item: row by row, where the lanes of a row are those with a particle of this rank.
+template <class S>
+struct PackedOrder {
+  uint16_t rank[kItemParticles];
+  unsigned lanes[kItemParticles];  // of a row
+  uint16_t start[kItemParticles];  // of a row in the packed order
+  int count[S::cells + 1], row[S::parts];
+
+  __device__ int place(int cell, int rank) const {
+    constexpr int width = 32 / S::slices;  // cells in a part
+    const int number = row[cell / width] + rank / S::slices, lane = rank % S::slices * width + cell % width;
+    return start[number] + __popc(lanes[number] & ((1u << lane) - 1));
+  }
+};
+
 // Memory of one warp.
 template <class S>
 union WarpMemory {
@@ -43,13 +58,11 @@ union WarpMemory {
     alignas(16) T u[S::tile];
     alignas(16) T sum[S::tile];
   } tile;
-  struct {
-    uint16_t rank[kItemParticles];
-    unsigned lanes[kItemParticles];  // of a row: lanes with a particle of this rank
-    uint16_t start[kItemParticles];  // of a row in the packed order
-    int count[S::cells + 1], row[S::parts];
-  } sort;
+  PackedOrder<S> sort;
 };
+
+// Bytes of a part of a work space.
+inline int64_t align_workspace(int64_t bytes) { return (bytes + 255) / 256 * 256; }
 
 template <class T, int D>
 struct PackedItems {
@@ -76,6 +89,17 @@ struct LaneCounts {
 #pragma unroll
     for (int part = 0; part < S::parts; part++)
       of_part[part] = (int(of_cell[part * 32 + lane % (32 / S::slices)]) + S::slices - 1 - slice) / S::slices;
+  }
+
+  // Leaves the particles of one part. Returns the number of those before it, which are packed first.
+  __device__ int keep(int only) {
+    int before = 0;
+#pragma unroll
+    for (int part = 0; part < S::parts; part++) {
+      if (part < only) before += __reduce_add_sync(~0u, of_part[part]);
+      if (part != only) of_part[part] = 0;
+    }
+    return before;
   }
 };
 
@@ -110,12 +134,27 @@ __device__ void walk_cells(const LaneCounts<S>& counts, const PackedParticle<T, 
   }
 }
 
-// Packs the particles of an item in the order of `walk_cells`: row by row, where the lanes of a row are those with a
-// particle of this rank.
+// Makes the rows for the counts of the cells, by one warp.
+template <class S>
+__device__ void set_rows(PackedOrder<S>& m) {
+  const LaneCounts<S> counts(m.count);
+#pragma unroll
+  for (int part = 0, row = 0, at = 0; part < S::parts; part++) {
+    if (lane_index() == 0) m.row[part] = row;
+    for (int k = 0; const unsigned lanes = __ballot_sync(~0u, counts.of_part[part] > k); k++, row++) {
+      if (lane_index() == 0) {
+        m.lanes[row] = lanes;
+        m.start[row] = uint16_t(at);
+      }
+      at += __popc(lanes);
+    }
+  }
+}
+
+// Packs the particles of an item in the order of `walk_cells`.
 template <class S, class T, int D>
 __device__ void pack_item(const Topology<T, D>& t, const Columns<const T, D>& x, const Columns<const T, 1>& conductance,
                           const Item& item, int number, const PackedItems<T, D>& packed, WarpMemory<S>& memory) {
-  constexpr int width = 32 / S::slices;  // cells in a part
   auto& m = memory.sort;
   const int lane = lane_index(), n = item.end - item.begin;
   const int* const index = t.index + item.begin;
@@ -145,18 +184,7 @@ __device__ void pack_item(const Topology<T, D>& t, const Columns<const T, D>& x,
     __syncwarp();
   }
   for (int c = lane; c < S::cells; c += 32) packed.counts[int64_t(number) * S::cells + c] = uint16_t(m.count[c]);
-  const LaneCounts<S> counts(m.count);
-#pragma unroll
-  for (int part = 0, row = 0, at = 0; part < S::parts; part++) {
-    if (lane == 0) m.row[part] = row;
-    for (int k = 0; const unsigned lanes = __ballot_sync(~0u, counts.of_part[part] > k); k++, row++) {
-      if (lane == 0) {
-        m.lanes[row] = lanes;
-        m.start[row] = uint16_t(at);
-      }
-      at += __popc(lanes);
-    }
-  }
+  set_rows(m);
   __syncwarp();
   ahead = read_vector(x, index_at(lane));
   T conductance_ahead = conductance.at(index_at(lane));
@@ -171,10 +199,7 @@ __device__ void pack_item(const Topology<T, D>& t, const Columns<const T, D>& x,
     particle = index_at(k + 64);
     int cell;
     if (!base_block.template locate<S::Order>(t.geometry, position, cell, q.f)) continue;
-    const int row = m.row[cell / width] + m.rank[k] / S::slices;
-    const int place = m.rank[k] % S::slices * width + cell % width;
-    const int at = m.start[row] + __popc(m.lanes[row] & ((1u << place) - 1));
-    packed.particles[item.begin + at] = q;
+    packed.particles[item.begin + m.place(cell, m.rank[k])] = q;
   }
   __syncwarp();
 }
@@ -231,11 +256,18 @@ __device__ void add_quad(T* nodes, const Vec4<T>& q) {
       if (q.e[k] != T(0)) atomicAdd(nodes + k, q.e[k]);
 }
 
-// Adds a sum over the packed particles of the items [number, end), which are of one base block, to the nodes; returns Σ
-// κ V |∇u|², the same in all lanes.
-template <HeatSum Sum, class S, class T, int D>
-__device__ T sum_items(const Topology<T, D>& t, const PackedItems<T, D>& packed, int number, int end, const T* u,
-                       T* out, bool in_order, WarpMemory<S>& memory) {
+// Values u of four nodes of a row, from an array.
+template <class T>
+struct StoredValues {
+  const T* u;
+  __device__ Vec4<T> at(int node) const { return load_vec4(u + node); }
+};
+
+// Adds a sum over the packed particles of the items [number, end), which are of one base block, or of one part of it,
+// to the nodes; returns Σ κ V |∇u|², the same in all lanes.
+template <HeatSum Sum, class S, class Values, class T, int D>
+__device__ T sum_items(const Topology<T, D>& t, const PackedItems<T, D>& packed, int number, int end, const Values& u,
+                       T* out, bool in_order, WarpMemory<S>& memory, int part = -1) {
   auto& m = memory.tile;
   const Item* const items = reinterpret_cast<const Item*>(schedule_of(t).items);
   LaneCounts<S> counts(packed.counts + int64_t(number) * S::cells);
@@ -243,7 +275,7 @@ __device__ T sum_items(const Topology<T, D>& t, const PackedItems<T, D>& packed,
   Vec4<T> loaded[TileQuads<S>::rounds];
 #pragma unroll
   for (int r = 0; r < quads.rounds; r++)
-    loaded[r] = Sum == HeatSum::product && quads.node[r] >= 0 ? load_vec4(u + quads.node[r]) : Vec4<T>{};
+    loaded[r] = Sum == HeatSum::product && quads.node[r] >= 0 ? u.at(quads.node[r]) : Vec4<T>{};
   __syncwarp();
 #pragma unroll
   for (int r = 0; r < quads.rounds; r++) {
@@ -255,8 +287,9 @@ __device__ T sum_items(const Topology<T, D>& t, const PackedItems<T, D>& packed,
   T from[S::nodes], to[S::nodes], power = T(0);
 #pragma unroll 1
   while (true) {
+    const int before = part < 0 ? 0 : counts.keep(part);
     walk_cells<S>(
-        counts, packed.particles + items[number].begin,
+        counts, packed.particles + items[number].begin + before,
         [&](int cell, bool some) {
           for_support<S>(cell, [&](int k, int i) {
             if (Sum == HeatSum::product) from[k] = some ? m.u[i] : T(0);  // u may be NaN away from the particles

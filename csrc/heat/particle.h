@@ -20,20 +20,26 @@ struct HeatWeights {
   T capacity, conductance, number, blend;
 };
 
+// |sym ∇v| [1/s].
 template <class T, int D>
-MPM_HD HeatWeights<T> heat_weights(const T& volume, const T& specific_heat, const T& conductivity, const T& mass,
-                                   const T& dt, const Matrix<T, D>& L, const T& dx) {
-  HeatWeights<T> w;
-  w.capacity = specific_heat * mass;
-  w.conductance = select(conductivity >= T(0), conductivity, T(NAN)) * volume;
+MPM_HD T strain_rate_of(const Matrix<T, D>& L) {
   T squared = T(0);
   MPM_UNROLL for (int i = 0; i < D; i++) MPM_UNROLL
     for (int j = 0; j < D; j++) {
       const T strain = T(0.5) * (L[i][j] + L[j][i]);
       squared = squared + strain * strain;
     }
+  return safe_root(squared);
+}
+
+template <class T>
+MPM_HD HeatWeights<T> heat_weights(const T& volume, const T& specific_heat, const T& conductivity, const T& mass,
+                                   const T& dt, const T& strain_rate, const T& dx) {
+  HeatWeights<T> w;
+  w.capacity = specific_heat * mass;
+  w.conductance = select(conductivity >= T(0), conductivity, T(NAN)) * volume;
   w.number = dt * w.conductance / (select(w.capacity > T(0), w.capacity, T(1)) * dx * dx);
-  const T rate = T(4) * w.number + dt * safe_root(squared);
+  const T rate = T(4) * w.number + dt * strain_rate;
   w.blend = select(rate > T(1), T(1), rate);
   return w;
 }

@@ -154,8 +154,9 @@ struct SceneSolver {
   __device__ void find_range() {
     for (int number = warp_index(); number < 3; number += warps()) {
       const int wanted = number < 2 ? scene + number : t.scenes;
-      const int slot = first_not_below(
-          t.max_blocks, [&](int i) { return t.block[i] >= 0 && t.block[i] / t.geometry.blocks_per_scene < wanted; });
+      const int slot = first_not_below(near_blocks(k.a), [&](int i) {
+        return t.block[i] >= 0 && t.block[i] / t.geometry.blocks_per_scene < wanted;
+      });
       if (lane_index() == 0) (number == 0 ? s.slot : number == 1 ? s.slot_end : s.used) = slot;
     }
     if (threadIdx.x < D) {
@@ -482,6 +483,10 @@ __global__ void __launch_bounds__(kSceneThreads<Order, T>)
   extern __shared__ __align__(16) unsigned char shared[];
   __shared__ SceneState<D> state;
   const int scene = int(blockIdx.x);
+  if (kernel.a.leaves_simple && simple_steps(kernel.a, scene) > 0) {
+    if (threadIdx.x == 0) kernel.w.left[scene] = false;
+    return;
+  }
   SceneSolver<Order, T, D> solver(kernel, state, scene, reinterpret_cast<T*>(shared));
   solver.find_range();
   solver.clear_unused();

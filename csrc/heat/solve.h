@@ -18,9 +18,13 @@ enum class HeatMethod { conjugate_gradients, chebyshev };
 // Residual [K] that a solve may always leave, NEGLIGIBLE in torch_mpm/heat/heat.py.
 constexpr double kNegligibleResidual = 1e-12;
 
+constexpr int kMostSimpleSteps = 2;
+
 template <class T, int D>
 struct HeatArguments {
   Topology<T, D> topology;
+  int near_blocks = 0;                 // on CUDA: slots in the order of scenes, zero for all; those after them have no
+                                       // particles
   Field<const T> x, conductance;       // conductance κ V [P]
   const T* heat_capacity = nullptr;    // [N], as those below
   const T* theta = nullptr;            // absent: zero
@@ -38,11 +42,20 @@ struct HeatArguments {
   const double* scene_bound = nullptr;  // [scenes], of the spectrum of H in units of M/dt + X where it is known, but
   double bound_scale = 1;               // for this factor
   bool deterministic = false;
-  T* increment = nullptr;     // [N]
-  int* iterations = nullptr;  // [scenes], as those below
+  bool leaves_simple = false;  // whether other kernels solve the scenes of simple_steps(); their results are unchanged
+  T* increment = nullptr;      // [N]
+  int* iterations = nullptr;   // [scenes], as those below
   T* residual = nullptr;
   bool* converged = nullptr;
   void* workspace = nullptr;  // bytes returned by heat_workspace()
+};
+
+// The steps of simple_steps() by kernels of their own, on CUDA: H u without packed particles, and then the increments.
+template <class T, int D>
+struct HeatSimpleArguments {
+  HeatArguments<T, D> solve;       // its increments are those of the other scenes
+  T* product[kMostSimpleSteps]{};  // [N] H θ, and H d after the first step; zero on entry
+  int step = 0;                    // number of the product
 };
 
 // H u, or the diagonal of H where u is absent.
@@ -113,17 +126,24 @@ struct HeatScene {
 inline namespace TORCH_MPM_ISA {
 
 template <class T, int D>
+MPM_HD int near_blocks(const HeatArguments<T, D>& a) {
+  return a.near_blocks > 0 ? a.near_blocks : a.topology.max_blocks;
+}
+
+template <class T, int D>
 MPM_HD double step_of_scene(const HeatArguments<T, D>& a, int scene) {
   return a.scene_dt ? a.dt * double(a.scene_dt[scene]) : a.dt;
 }
+
+// Those for a bound c and a tolerance of the residual.
+MPM_HD int simple_steps_of(double c, double tolerance) { return c <= tolerance ? 1 : c * c <= tolerance ? 2 : 0; }
 
 // Number of steps d += (M/dt + X)⁻¹ r that a known bound c of the spectrum shows to suffice, since each multiplies the
 // residual by c at most; zero where it is unknown or too large. Such scenes need no diagonal and no scalar products.
 template <class T, int D>
 MPM_HD int simple_steps(const HeatArguments<T, D>& a, int scene) {
   if (!a.scene_bound || scene < 0 || a.method != HeatMethod::conjugate_gradients) return 0;
-  const double c = a.bound_scale * a.scene_bound[scene];
-  return c <= a.relative_tolerance ? 1 : c * c <= a.relative_tolerance ? 2 : 0;
+  return simple_steps_of(a.bound_scale * a.scene_bound[scene], a.relative_tolerance);
 }
 
 // Whether the next step is the last one of them: it needs neither H p nor the residual.
@@ -142,34 +162,64 @@ MPM_HD void finish_simple_steps(const HeatArguments<T, D>& a, int scene, HeatSce
   s.running = false;
 }
 
-// First right side, for zero increment, of node i of the vectors, which lies in `row`. `used` is false for rows of
-// unused blocks.
+// The equation of a node at the start, where `product` is H θ. Nodes that are not free have no weight and no residual.
+template <class T>
+struct NodeEquation {
+  bool free, open;  // whether the node is an unknown, and whether heat leaves through it
+  T mass, source, weight, residual;
+};
+
+template <class T, int D>
+MPM_HD NodeEquation<T> node_equation(const HeatArguments<T, D>& a, int64_t row, const T& product, double dt) {
+  const T mass = a.heat_capacity[row], exchange = a.exchange ? a.exchange[row] : T(0);
+  const bool material = !(mass <= T(0)), held = material && a.fixed && a.fixed[row], free = material && !held;
+  NodeEquation<T> e{free, held || (free && exchange != T(0)), mass, a.source ? a.source[row] : T(0), T(0), T(0)};
+  if (!free) return e;
+  e.weight = mass / T(dt) + exchange;
+  e.residual = e.source - product;
+  if (a.theta) e.residual -= exchange * a.theta[row];
+  return e;
+}
+
+// Starts node i of the vectors, which lies in `row`, for zero increment. `used` is false for rows of unused blocks.
 template <class T, int D>
 MPM_HD StartSums<T> start_node(const HeatArguments<T, D>& a, const HeatVectors<T>& v, int64_t row, int64_t i, double dt,
                                bool used) {
-  const T mass = used ? a.heat_capacity[row] : T(0), exchange = a.exchange && used ? a.exchange[row] : T(0);
-  const T source = a.source && used ? a.source[row] : T(0);
-  const bool material = used && !(mass <= T(0)), held = material && a.fixed && a.fixed[row], free = material && !held;
   auto sums = StartSums<T>::zero();
   const T product = v.product[i], diagonal = v.inverse[i], bound = v.weight[i];
   v.p[i] = v.product[i] = v.mass[i] = v.weight[i] = v.inverse[i] = v.r[i] = T(0);
-  sums.open = held || (free && exchange != T(0));
-  if (!free) return sums;
-  const T weight = mass / T(dt) + exchange;
-  const T inverse = T(1) / (a.method == HeatMethod::chebyshev ? weight : weight + diagonal);
-  T r = source - product;
-  if (a.theta) r -= exchange * a.theta[row];
-  v.mass[i] = mass;
-  v.weight[i] = weight;
+  if (!used) return sums;
+  const NodeEquation<T> e = node_equation(a, row, product, dt);
+  sums.open = e.open;
+  if (!e.free) return sums;
+  const T inverse = T(1) / (a.method == HeatMethod::chebyshev ? e.weight : e.weight + diagonal);
+  v.mass[i] = e.mass;
+  v.weight[i] = e.weight;
   v.inverse[i] = inverse;
-  v.r[i] = r;
-  sums.heat = mass;
-  sums.residual = r * (r / mass);
-  sums.preconditioned = r * (r * inverse);
-  sums.source = source;
-  sums.bound = bound / weight;
-  sums.spread = T(dt) * (weight / mass);
+  v.r[i] = e.residual;
+  sums.heat = e.mass;
+  sums.residual = e.residual * (e.residual / e.mass);
+  sums.preconditioned = e.residual * (e.residual * inverse);
+  sums.source = e.source;
+  sums.bound = bound / e.weight;
+  sums.spread = T(dt) * (e.weight / e.mass);
   return sums;
+}
+
+// The values u of a product H u of the simple steps.
+template <class T, int D>
+MPM_HD T simple_direction(const HeatSimpleArguments<T, D>& a, int64_t row, double dt) {
+  if (a.step == 0) return a.solve.theta[row];
+  const NodeEquation<T> e = node_equation(a.solve, row, a.product[0][row], dt);
+  return e.free ? e.residual / e.weight : T(0);
+}
+
+// The increment of a node after these steps. The second residual is −H d.
+template <class T, int D>
+MPM_HD T simple_increment(const HeatSimpleArguments<T, D>& a, int64_t row, int steps, double dt) {
+  const NodeEquation<T> e = node_equation(a.solve, row, a.product[0][row], dt);
+  if (!e.free) return T(0);
+  return (steps > 1 ? e.residual - a.product[1][row] : e.residual) / e.weight;
 }
 
 // Next direction; returns the part of p · A p without H.

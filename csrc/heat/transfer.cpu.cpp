@@ -39,9 +39,9 @@ void heat_to_nodes(const HeatToNodesArguments<T, D>& a) {
     constexpr int N = std::remove_cvref_t<decltype(g)>::kSize;
     using P = Pack<T, N>;
     const P dt(time_step(a.scene_dt, a.dt, scene));
-    HeatWeights<P> w =
-        heat_weights<P, D>(load(a.particles.volume, g), load(a.specific_heat, g, scene), load(a.conductivity, g, scene),
-                           load(a.mass, g), dt, load_matrix_or_zero<T, D>(a.velocity_gradient, g), P(geometry.dx));
+    const P strain_rate = strain_rate_of(load_matrix_or_zero<T, D>(a.velocity_gradient, g));
+    HeatWeights<P> w = heat_weights(load(a.particles.volume, g), load(a.specific_heat, g, scene),
+                                    load(a.conductivity, g, scene), load(a.mass, g), dt, strain_rate, P(geometry.dx));
     w.blend = blend_of(a.transfer, w.blend);
     put(w.conductance, a.conductance, g);
     put(w.blend, a.blend, g);

@@ -3,6 +3,7 @@
 #include "common/fields.h"
 #include "grid/obstacle.h"
 #include "grid/topology.h"
+#include "heat/solve.h"
 
 // Transfer of temperature between particles and nodes in a rollout. The particles of the call are those of its P2G and
 // G2P, with the same activation.
@@ -49,7 +50,9 @@ struct HeatToNodesArguments {
   Field<const T> scene_dt;
   double dt = 0;
   bool deterministic = false;
-  Field<T> conductance, blend, number;  // results per particle
+  Field<const T> strain_rate;           // on CUDA, where G2P stores it
+  Field<T> conductance, blend, number;  // results per particle; the number may be absent on CUDA
+  double* largest = nullptr;            // on CUDA: [scenes], raised to the largest number of a particle
   NodeField<T> sums;                    // kHeatChannels, zero on entry
 };
 
@@ -63,6 +66,8 @@ struct HeatMeansArguments {
   T* capacity = nullptr;
   T* start = nullptr;  // may be absent, and `fixed` with it
   bool* fixed = nullptr;
+  T* cleared = nullptr;  // on CUDA: other memory, which is set to zero for the next substep
+  int64_t cleared_size = 0;
 };
 
 // Replaces w θ in the sums by the change of the temperatures: the increments of the solve, from `start` on, which
@@ -88,6 +93,7 @@ struct HeatToParticlesArguments {
   NodeField<const T> nodes;          // the sums from kHeatTheta on: increment and θ̄
   Field<T> theta, gradient, liquid;  // results, in other memory than the inputs
   Field<T> changing;                 // diffusion number where the liquid fraction changes, else zero; may be absent
+  double* largest = nullptr;         // on CUDA: column [scenes] of the status, raised to the largest of these numbers
 };
 
 // Nodes with matter in an obstacle are held at a temperature.
@@ -154,6 +160,17 @@ struct HeatTermArguments {
   double reference = 0;
   T* exchange = nullptr;
   T* source = nullptr;
+};
+
+// The increments of all nodes, in place of w θ in their sums: those of simple steps, and those of the solve for the
+// other scenes, whose solves are added to the status.
+template <class T, int D>
+struct HeatFinishArguments {
+  HeatSimpleArguments<T, D> simple;
+  const T* theta = nullptr;  // averages of the nodes
+  T* sums = nullptr;
+  double* status = nullptr;              // [scenes, kHeatStatusSize]
+  Displacement* displacement = nullptr;  // requests an activation where a scene may soon need more; may be absent
 };
 
 // Adds the solves of a substep to the status of the scenes.

@@ -22,7 +22,8 @@ struct HeatWeightsOfParticle {
     const T volume = rest * J * determinant(in.matrix());
     const T specific_heat = in.scalar(), conductivity = in.scalar(), mass = in.scalar(), dt = in.scalar();
     const Matrix<T, D> L = in.matrix();
-    const HeatWeights<T> w = heat_weights<T, D>(volume, specific_heat, conductivity, mass, dt, L, in.scalar());
+    const HeatWeights<T> w =
+        heat_weights(volume, specific_heat, conductivity, mass, dt, strain_rate_of(L), in.scalar());
     out.put(volume);
     out.put(w.capacity);
     out.put(w.conductance);

@@ -31,6 +31,9 @@ class HeatSteps {
   bool heats_by_laws() const { return dissipated_ >= 0; }
   Field<T> dissipated() { return column(fields.next(false), dissipated_); }
 
+  // Whether begin() is needed: G2P has not stored the present volumes, or laws store what they dissipate.
+  bool begins() const { return !has_volumes_ || heats_by_laws(); }
+
   // Computes the present volumes; before laws change F.
   void begin(const Field<const T>& F, const Field<const T>& J, const Field<const T>& rest, backend::Stream stream) {
     HeatVolumesArguments<T, D> a;
@@ -43,21 +46,38 @@ class HeatSteps {
     backend::heat_volumes(a, stream);
   }
 
+  // Lets G2P of the substep store the strain rates, and the volumes for the next substep; on CUDA in a call whose
+  // activations last.
+  void use_g2p() {
+    if (!s_.displacements.defined()) return;
+    if (!strain_rate_.defined()) strain_rate_ = empty(in_.x, {particles()});
+    HeatAdvanceArguments<T, D>& a = s_.with_heat;
+    a.rest = s_.p2g.volume;
+    a.volume = column(fields.now(), volume_);
+    a.strain_rate = field<T>(strain_rate_);
+    a.volume_next = column(fields.next(true), volume_);
+    has_volumes_ = true;
+  }
+
   // Computes the temperatures after a substep, with positions before it and the velocity gradient after it.
   void run(const Field<const T>& x, const Field<const T>& mass, const Field<const T>& rest,
            const Field<const T>& velocity_gradient, const Field<const int>& scene, backend::Stream stream) {
     make_nodes(stream);
     HeatToNodesArguments<T, D> down = to_nodes(x, mass, velocity_gradient);
     backend::heat_to_nodes(in_.lattice.order(), down, stream);
-    if (exchanges()) backend::clear(exchange_, stream), backend::clear(source_, stream);
     if (holds_surface()) add_layers(x, scene, stream);
     means(stream);
     if (has_terms()) add_terms(x, rest, stream);
-    solve(x, scene, stream);
+    HeatArguments<T, D> a = equations(x, stream);
+    if (takes_simple_steps())
+      solve_by_simple_steps(a, stream);
+    else
+      solve(a, scene, stream);
     HeatToParticlesArguments<T, D> up = to_particles(down);
     backend::heat_to_particles(in_.lattice.order(), up, stream);
     fields.go(true);
-    count(scene, stream);
+    if (melts() && MPM_BACKEND == MPM_BACKEND_IS_cpu)
+      find_largest(field<const T>(changing_), scene, rows_of_status() + kLargestFront, kHeatStatusSize, stream);
   }
 
  private:
@@ -74,6 +94,9 @@ class HeatSteps {
   // The gradient is the last tensor of `heat`.
   bool has_gradient() const { return in_.heat.size() % 3 == 1; }
   bool exchanges() const { return holds_surface() || has_terms(); }
+  // Whether scenes of few simple steps have kernels of their own. Sums on deterministic grids have an order.
+  bool takes_simple_steps() const { return MPM_BACKEND == MPM_BACKEND_IS_cuda && !in_.lattice.deterministic(); }
+  double* rows_of_status() const { return static_cast<double*>(status.data_ptr()); }
   const T* held_temperature(int64_t k) const { return temperatures_.pointer + k * temperatures_.stride[0]; }
 
   template <class E>
@@ -95,27 +118,37 @@ class HeatSteps {
   void read_parameter(const Tensor& t, const char* name);
   HeatValue<T> value(size_t k) const;
   void make_nodes(backend::Stream stream);
+  int64_t lay_out_cleared(T* memory, int64_t nodes);
   HeatToNodesArguments<T, D> to_nodes(const Field<const T>& x, const Field<const T>& mass,
                                       const Field<const T>& velocity_gradient) const;
   HeatToParticlesArguments<T, D> to_particles(const HeatToNodesArguments<T, D>& down);
-  void solve(const Field<const T>& x, const Field<const int>& scene, backend::Stream stream);
+  HeatArguments<T, D> equations(const Field<const T>& x, backend::Stream stream);
+  void solve(HeatArguments<T, D>& a, const Field<const int>& scene, backend::Stream stream);
+  void solve_by_simple_steps(HeatArguments<T, D>& a, backend::Stream stream);
   void find_largest(const Field<const T>& of, const Field<const int>& scene, double* to, int64_t stride,
                     backend::Stream stream) const;
-  void count(const Field<const int>& scene, backend::Stream stream);
 
   Substeps<T, D>& s_;
   const SubstepsInputs& in_;
   int gradient_ = -1, liquid_ = -1, volume_ = 1, dissipated_ = -1;  // columns
   std::vector<HeatValue<T>> values_;  // of the parameters; those per particle have no pointer
   std::vector<int> own_;              // index in `parameters`, or -1
-  Tensor conductance_, blend_, number_, changing_;
-  Tensor largest_;                // diffusion number of a particle in each scene
+  Tensor conductance_, blend_, number_, changing_, strain_rate_ = absent();
+  bool has_volumes_ = false;
   Field<const T> temperatures_;   // of the held obstacles [K, B]
   Tensor exchange_of_particles_;  // with the held surface
-  Tensor start_, fixed_, source_, exchange_, surface_;
+  Tensor start_, fixed_;
   size_t power_ = 0;  // its number among the parameters
   int64_t slots_ = -1;
-  Tensor sums_, theta_, capacity_, increment_, iterations_, residual_, converged_, workspace_;
+  // Memory that is zero when a substep begins, used in turn: the largest diffusion number of a particle in each scene;
+  // and by nodes the sums, exchange and source, the sums of the surface, and the products of the simple steps.
+  static constexpr int kTurns = MPM_BACKEND == MPM_BACKEND_IS_cuda ? 2 : 1;
+  Tensor cleared_[kTurns];
+  int turn_ = 0;
+  double* largest_ = nullptr;
+  T *sums_ = nullptr, *exchange_ = nullptr, *source_ = nullptr, *surface_ = nullptr;
+  T* product_[kMostSimpleSteps] = {};
+  Tensor theta_, capacity_, increment_, iterations_, residual_, converged_, workspace_;
 };
 
 template <class T, int D>
@@ -147,9 +180,8 @@ HeatSteps<T, D>::HeatSteps(Substeps<T, D>& steps) : s_(steps), in_(steps.in) {
   if (has_power()) read_parameter(in_.heat_boundaries[kPower], "the power of heat");
   conductance_ = empty(x, {P});
   blend_ = empty(x, {P});
-  number_ = empty(x, {P});
-  if (melts()) changing_ = empty(x, {P});
-  largest_ = empty(x, {in_.scenes}, ScalarType::Double);
+  if (MPM_BACKEND == MPM_BACKEND_IS_cpu || melts()) number_ = empty(x, {P});
+  if (MPM_BACKEND == MPM_BACKEND_IS_cpu && melts()) changing_ = empty(x, {P});
   status = empty(x, {in_.scenes, int64_t(kHeatStatusSize)}, ScalarType::Double);
   torch::stable::zero_(status);
   iterations_ = empty_int(x, {in_.scenes});
@@ -212,17 +244,19 @@ void HeatSteps<T, D>::add_layers(const Field<const T>& x, const Field<const int>
   a.conductance = field<T>(conductance_);
   a.exchange = column(field<T>(exchange_of_particles_), 0);
   backend::heat_layers(a, stream);
-  T* const exchange = static_cast<T*>(exchange_.data_ptr());
   ScatterArguments<T, D> down;
   down.topology = s_.p2g.topology;
   down.x = x;
   down.value = field<const T>(exchange_of_particles_);
   down.deterministic = in_.lattice.deterministic();
-  down.nodes = {exchange, 1, 1};
+  down.nodes = {exchange_, 1, 1};
+#if MPM_BACKEND == MPM_BACKEND_IS_cuda
+  backend::heat_exchange(in_.lattice.order(), down, stream);  // of particles that may have left their base blocks
+#else
   backend::scatter(in_.lattice.order(), down, stream);
+#endif
   backend::heat_from_surface(
-      HeatFromSurfaceArguments<T, D>{s_.p2g.topology, held_temperature(k), temperatures_.stride[1], exchange,
-                                     static_cast<T*>(source_.data_ptr())},
+      HeatFromSurfaceArguments<T, D>{s_.p2g.topology, held_temperature(k), temperatures_.stride[1], exchange_, source_},
       stream);
 }
 
@@ -259,22 +293,46 @@ HeatValue<T> HeatSteps<T, D>::value(size_t k) const {
   return {f.pointer, f.stride[0], false};
 }
 
-// Makes the node tensors for the size of the pool.
+// Makes the node tensors for the size of the pool. Some are zero when a substep begins; on CUDA a substep clears those
+// of the next one, in another kernel's pass over the nodes.
 template <class T, int D>
 void HeatSteps<T, D>::make_nodes(backend::Stream stream) {
   const int64_t slots = s_.activation.slots(), nodes = slots * kBlockNodes<D>;
   if (slots != slots_) {
     slots_ = slots;
-    sums_ = empty(in_.x, {nodes, kHeatChannels});
     theta_ = empty(in_.x, {nodes});
     capacity_ = empty(in_.x, {nodes});
     increment_ = empty(in_.x, {nodes});
     if (held_nodes() > 0) start_ = empty(in_.x, {nodes}), fixed_ = empty(in_.x, {nodes}, ScalarType::Bool);
-    if (exchanges()) exchange_ = empty(in_.x, {nodes}), source_ = empty(in_.x, {nodes});
-    if (has_terms()) surface_ = empty(in_.x, {nodes, kHeatChannels});
     workspace_ = Tensor();
+    for (int turn = 0; turn < kTurns; turn++) {
+      cleared_[turn] = empty(in_.x, {lay_out_cleared(nullptr, nodes)});
+      backend::clear(cleared_[turn], stream);
+    }
   }
-  backend::clear(sums_, stream);
+  turn_ = kTurns - 1 - turn_;
+  lay_out_cleared(static_cast<T*>(cleared_[turn_].data_ptr()), nodes);
+  if (MPM_BACKEND == MPM_BACKEND_IS_cpu) backend::clear(cleared_[turn_], stream);
+}
+
+// Returns the number of scalars.
+template <class T, int D>
+int64_t HeatSteps<T, D>::lay_out_cleared(T* memory, int64_t nodes) {
+  constexpr int64_t kAligned = 64;
+  int64_t size = 0;
+  const auto take = [&](int64_t count) {
+    T* const begin = memory ? memory + size : nullptr;
+    size += count;
+    return begin;
+  };
+  const int64_t scenes = in_.scenes * int64_t(sizeof(double) / sizeof(T));
+  largest_ = reinterpret_cast<double*>(take((scenes + kAligned - 1) / kAligned * kAligned));
+  sums_ = take(nodes * kHeatChannels);
+  if (exchanges()) exchange_ = take(nodes), source_ = take(nodes);
+  if (has_terms()) surface_ = take(nodes * kHeatChannels);
+  if (takes_simple_steps())
+    for (T*& product : product_) product = take(nodes);
+  return size;
 }
 
 template <class T, int D>
@@ -285,6 +343,7 @@ HeatToNodesArguments<T, D> HeatSteps<T, D>::to_nodes(const Field<const T>& x, co
   a.x = x;
   a.mass = mass;
   a.velocity_gradient = velocity_gradient;
+  a.strain_rate = constant(s_.with_heat.strain_rate);
   a.particles = columns();
   a.conductivity = value(0);
   a.specific_heat = value(1);
@@ -295,7 +354,8 @@ HeatToNodesArguments<T, D> HeatSteps<T, D>::to_nodes(const Field<const T>& x, co
   a.conductance = field<T>(conductance_);
   a.blend = field<T>(blend_);
   a.number = field<T>(number_);
-  a.sums = {static_cast<T*>(sums_.data_ptr()), kHeatChannels, kHeatChannels};
+  if (MPM_BACKEND == MPM_BACKEND_IS_cuda) a.largest = largest_;
+  a.sums = {sums_, kHeatChannels, kHeatChannels};
   return a;
 }
 
@@ -314,12 +374,13 @@ HeatToParticlesArguments<T, D> HeatSteps<T, D>::to_particles(const HeatToNodesAr
   a.scene_dt = down.scene_dt;
   a.dt = down.dt;
   a.moment_scale = in_.lattice.inverse_inertia();
-  a.nodes = {down.sums.pointer + kHeatTheta, kHeatChannels, kHeatChannels - kHeatTheta};
+  a.nodes = {sums_ + kHeatTheta, kHeatChannels, kHeatChannels - kHeatTheta};
   const Field<T> next = fields.next(true);
   a.theta = column(next, 0);
   a.gradient = column(next, gradient_);
   a.liquid = column(next, liquid_);
   a.changing = field<T>(changing_);
+  if (MPM_BACKEND == MPM_BACKEND_IS_cuda) a.largest = rows_of_status() + kLargestFront;
   return a;
 }
 
@@ -332,11 +393,16 @@ void HeatSteps<T, D>::find_largest(const Field<const T>& of, const Field<const i
 
 template <class T, int D>
 void HeatSteps<T, D>::means(backend::Stream stream) {
-  HeatMeansArguments<T, D> a{slots_ * kBlockNodes<D>, static_cast<T*>(sums_.data_ptr()),
-                             static_cast<T*>(theta_.data_ptr()), static_cast<T*>(capacity_.data_ptr())};
+  HeatMeansArguments<T, D> a{slots_ * kBlockNodes<D>, sums_, static_cast<T*>(theta_.data_ptr()),
+                             static_cast<T*>(capacity_.data_ptr())};
   if (held_nodes() > 0) {
     a.start = static_cast<T*>(start_.data_ptr());
     a.fixed = static_cast<bool*>(fixed_.data_ptr());
+  }
+  if (MPM_BACKEND == MPM_BACKEND_IS_cuda) {
+    const Tensor& next = cleared_[1 - turn_];
+    a.cleared = static_cast<T*>(next.data_ptr());
+    a.cleared_size = next.numel();
   }
   backend::heat_means(a, stream);
 }
@@ -356,8 +422,6 @@ void HeatSteps<T, D>::check_terms() {
 // The terms of the free surface, and the heat from inside the matter.
 template <class T, int D>
 void HeatSteps<T, D>::add_terms(const Field<const T>& x, const Field<const T>& rest, backend::Stream stream) {
-  backend::clear(surface_, stream);
-  T* const sums = static_cast<T*>(surface_.data_ptr());
   HeatSurfaceArguments<T, D> down;
   down.topology = s_.p2g.topology;
   down.x = x;
@@ -371,15 +435,15 @@ void HeatSteps<T, D>::add_terms(const Field<const T>& x, const Field<const T>& r
     down.dt = in_.dt;
   }
   down.deterministic = in_.lattice.deterministic();
-  down.sums = {sums, kHeatChannels, kHeatChannels};
+  down.sums = {surface_, kHeatChannels, kHeatChannels};
   backend::heat_surface(in_.lattice.order(), down, stream);
   HeatTermArguments<T, D> a;
   a.topology = s_.p2g.topology;
-  a.sums = sums;
+  a.sums = surface_;
   a.theta = field<const T>(theta_).pointer;
   a.reference = in_.heat_scalars[1];
-  a.exchange = static_cast<T*>(exchange_.data_ptr());
-  a.source = static_cast<T*>(source_.data_ptr());
+  a.exchange = exchange_;
+  a.source = source_;
   for (size_t k = 0; k < in_.heat_terms.size(); k++) {
     a.term = HeatTerm(in_.heat_terms[k]);
     a.number = static_cast<const T*>(in_.heat_boundaries[kNumbers].data_ptr()) + 2 * int64_t(k) * in_.scenes;
@@ -389,51 +453,64 @@ void HeatSteps<T, D>::add_terms(const Field<const T>& x, const Field<const T>& r
   if (has_power() || heats_by_laws()) backend::heat_add_term(a, stream);
 }
 
+// The equations of the temperatures of the nodes.
 template <class T, int D>
-void HeatSteps<T, D>::solve(const Field<const T>& x, const Field<const int>& scene, backend::Stream stream) {
-  const int64_t nodes = slots_ * kBlockNodes<D>;
-  T* const sums = static_cast<T*>(sums_.data_ptr());
-  T* const theta = static_cast<T*>(theta_.data_ptr());
-  T* const capacity = static_cast<T*>(capacity_.data_ptr());
+HeatArguments<T, D> HeatSteps<T, D>::equations(const Field<const T>& x, backend::Stream stream) {
   HeatArguments<T, D> a;
   a.topology = s_.p2g.topology;
+  a.near_blocks = s_.activation.max_blocks;
   a.x = x;
   a.conductance = field<const T>(conductance_);
-  a.heat_capacity = capacity;
-  a.theta = theta;
+  a.heat_capacity = field<const T>(capacity_).pointer;
+  a.theta = field<const T>(theta_).pointer;
   a.dt = in_.dt;
   a.scene_dt = s_.p2g.scene_dt.pointer;
   a.tolerance = kNegligibleResidual;
   a.relative_tolerance = in_.heat_scalars[0];
   a.most = int(in_.heat_options[1]);
   // With W = M/dt, u · H u ≤ Σ K_i u_i² and K_i = D⁻¹ Σ_p κ_p V_p N_i ≤ D⁻¹ dx² max_p r_p W_i (csrc/heat/cell.h).
-  double* const largest = static_cast<double*>(largest_.data_ptr());
-  backend::clear(largest_, stream);
-  find_largest(field<const T>(number_), scene, largest, 1, stream);
-  a.scene_bound = largest;
+  a.scene_bound = largest_;
   a.bound_scale = in_.lattice.inverse_inertia() * in_.lattice.dx() * in_.lattice.dx();
   a.deterministic = in_.lattice.deterministic();
   if (held_nodes() > 0) hold_nodes(a, stream);
-  if (exchanges()) a.exchange = field<const T>(exchange_).pointer, a.source = field<const T>(source_).pointer;
+  a.exchange = exchange_;
+  a.source = source_;
   a.increment = static_cast<T*>(increment_.data_ptr());
   a.iterations = static_cast<int*>(iterations_.data_ptr());
   a.residual = static_cast<T*>(residual_.data_ptr());
   a.converged = static_cast<bool*>(converged_.data_ptr());
+  a.leaves_simple = takes_simple_steps();
   if (!workspace_.defined()) workspace_ = empty(in_.x, {backend::heat_workspace(a, stream)}, ScalarType::Byte);
   a.workspace = workspace_.data_ptr();
-  backend::heat_cg(in_.lattice.order(), a, stream);
-  backend::heat_increments(HeatIncrementsArguments<T, D>{nodes, a.increment, a.theta, theta, sums}, stream);
+  return a;
 }
 
-// Adds the solves and fronts of a substep to the status.
+// Solves the equations of all scenes, and adds the solves to the status.
 template <class T, int D>
-void HeatSteps<T, D>::count(const Field<const int>& scene, backend::Stream stream) {
-  double* const rows = static_cast<double*>(status.data_ptr());
+void HeatSteps<T, D>::solve(HeatArguments<T, D>& a, const Field<const int>& scene, backend::Stream stream) {
+  if (MPM_BACKEND == MPM_BACKEND_IS_cpu) find_largest(field<const T>(number_), scene, largest_, 1, stream);
+  backend::heat_cg(in_.lattice.order(), a, stream);
+  backend::heat_increments(HeatIncrementsArguments<T, D>{slots_ * kBlockNodes<D>, a.increment, a.theta,
+                                                         field<const T>(theta_).pointer, sums_},
+                           stream);
   backend::heat_count(
-      HeatCountArguments<T, D>{in_.scenes, static_cast<const bool*>(converged_.data_ptr()),
-                               static_cast<const T*>(residual_.data_ptr()), s_.p2g.scene_dt.pointer, rows},
-      stream);
-  if (melts()) find_largest(field<const T>(changing_), scene, rows + kLargestFront, kHeatStatusSize, stream);
+      HeatCountArguments<T, D>{in_.scenes, a.converged, a.residual, s_.p2g.scene_dt.pointer, rows_of_status()}, stream);
+}
+
+// The same, on CUDA, where scenes of simple steps have kernels of their own. These allow particles that have left their
+// base blocks. The solver of the other scenes does not, so an activation is requested where a scene may soon be one.
+template <class T, int D>
+void HeatSteps<T, D>::solve_by_simple_steps([[maybe_unused]] HeatArguments<T, D>& a,
+                                            [[maybe_unused]] backend::Stream stream) {
+#if MPM_BACKEND == MPM_BACKEND_IS_cuda
+  HeatSimpleArguments<T, D> simple{a, {product_[0], product_[1]}};
+  for (simple.step = 0; simple.step < kMostSimpleSteps; simple.step++)
+    backend::heat_simple_step(in_.lattice.order(), simple, stream);
+  backend::heat_cg(in_.lattice.order(), a, stream);
+  backend::heat_finish(HeatFinishArguments<T, D>{simple, field<const T>(theta_).pointer, sums_, rows_of_status(),
+                                                 s_.advance.displacement},
+                       stream);
+#endif
 }
 
 }  // namespace mpm

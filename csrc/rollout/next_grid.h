@@ -22,6 +22,7 @@ struct NextGridArguments {
   Displacement* watched = nullptr;  // kLost if nodes move so far that particles may leave the active blocks; or null
   int* items_taken = nullptr;       // counter to clear; or null
   int64_t particles = 0;
+  int out_of_block_cost = kOutOfBlockCost;
 };
 
 }  // namespace mpm

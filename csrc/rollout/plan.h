@@ -137,9 +137,9 @@ struct ScheduleEntry {
 };
 
 // Whether sums of nodes are independent of the order of their terms, in deterministic mode on CUDA. Only without
-// gradients: the backward pass recomputes its steps one by one.
+// gradients: the backward pass recomputes its steps one by one. The sums of heat have an order.
 inline bool sums_are_fixed(const PlanFacts& f) {
-  return f.cuda && f.float32 && f.deterministic && !f.gradients && !f.impulses && !f.clocks && !f.mirrors;
+  return f.cuda && f.float32 && f.deterministic && !f.gradients && !f.impulses && !f.clocks && !f.mirrors && !f.heat;
 }
 
 // Reason why no kernel combines the law and P2G.

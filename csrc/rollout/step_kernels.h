@@ -9,6 +9,7 @@
 #include "grid/impulse.op.h"
 #include "grid/obstacle.op.h"
 #include "grid/walls.op.h"
+#include "heat/kernels.h"
 #include "laws/law.op.h"
 #include "rollout/fused_law.h"
 #include "rollout/inputs.h"
@@ -36,6 +37,7 @@ struct Substeps {
   GridUpdateArguments<T, D> update;
   ContactArguments<T, D> contact;
   G2PAdvanceArguments<T, D> advance;
+  HeatAdvanceArguments<T, D> with_heat;  // with `advance` of this struct
   Pool<T, D> pool;
   Tensor stress = absent(), step_time = absent();
   Tensor scene_time = absent();                         // the time of each scene now, where each has its own
@@ -181,8 +183,9 @@ struct Substeps {
     torch::stable::zero_(displacements);
     p2g.displaced = true;
     advance.loads_ahead = true;
-    for (LawUpdateArguments<T, D>& law : laws) law.runs_beside = !law.adds;
+    for (LawUpdateArguments<T, D>& law : laws) law.runs_beside = !law.adds && in.heat.empty();
     next.particles = in.x.size(0);
+    if (!in.heat.empty()) activation.out_of_block_cost = next.out_of_block_cost = kOutOfBlockCostWithHeat;
     next.obstacles = obstacles && !impulse.defined();  // impulses need the velocities before contact
     const int64_t most = std::min<int64_t>(update.block_count, INT32_MAX / kBlockNodes<D> - activation.max_blocks);
     activation.margin_blocks = int(std::clamp<int64_t>(activation.max_blocks / 2 + 64, 0, std::max<int64_t>(most, 0)));
@@ -209,8 +212,10 @@ struct Substeps {
   }
 
   // Whether P2G updates F or J. It needs the affine field and a kernel of the law; particles stay in place in memory.
+  // Heat reads F and J after G2P.
   bool moves_late() const {
-    return fused && displacements.defined() && in.apic && facts.one_deformation && in.x.size(0) <= kMostLateParticles;
+    return fused && displacements.defined() && in.apic && facts.one_deformation && in.heat.empty() &&
+           in.x.size(0) <= kMostLateParticles;
   }
 
   void forget_stress() {
@@ -256,8 +261,19 @@ struct Substeps {
   void move(backend::Stream stream) {
     if (flips()) keep_velocities(p2g, field<T>(kept), stream);
     move_grid(stream);
-    backend::g2p_advance(in.lattice.order(), advance, stream);
+    move_particles(stream);
     if (flips()) add_flip(field<const T>(kept), stream);
+  }
+
+  // G2P, which may also store what heat needs.
+  void move_particles(backend::Stream stream) {
+#if MPM_BACKEND == MPM_BACKEND_IS_cuda
+    if (with_heat.strain_rate.pointer) {
+      with_heat.advance = advance;
+      return backend::heat_g2p_advance(in.lattice.order(), with_heat, stream);
+    }
+#endif
+    backend::g2p_advance(in.lattice.order(), advance, stream);
   }
 
   // Advances the time after a step, on the CPU and for scenes with separate clocks.

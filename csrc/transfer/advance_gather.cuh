@@ -103,6 +103,12 @@ struct AdvanceGather {
   __device__ mpm::Vector<T, D> write(int p, const Loaded& l, const Result& s) const { return write(p, p, p, l, s); }
   // The motion is written to its own row, the other fields to row `to`.
   __device__ mpm::Vector<T, D> write(int p, int of_motion, int to, const Loaded& l, const Result& s) const {
+    return write(p, of_motion, to, l, s, [](const Matrix<T, D>&, const Matrix<T, D>&, const T&) {});
+  }
+  // Calls also(∇v, F, J) with those after the step.
+  template <class Also>
+  __device__ mpm::Vector<T, D> write(int p, int of_motion, int to, const Loaded& l, const Result& s,
+                                     const Also& also) const {
     const Motion<T, D> m = motion(s);
     Matrix<T, D> L;
 #pragma unroll
@@ -123,7 +129,9 @@ struct AdvanceGather {
     for (int i = 0; i < D; i++)
 #pragma unroll
       for (int j = 0; j < D; j++) F_next.write(to, i * D + j, deformed[i][j]);
-    J_next.write(to, 0, advance_volume_ratio(l.J, L, l.dt));
+    const T ratio = advance_volume_ratio(l.J, L, l.dt);
+    J_next.write(to, 0, ratio);
+    also(L, deformed, ratio);
     return x;
   }
   // New position. Residuals are loaded here, where no other registers are in use, as most scenes have none.

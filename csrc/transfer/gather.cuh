@@ -289,13 +289,15 @@ class Follower {
 
 // Task: topology, nodes, position; load(p, scene), inputs of a particle; compute(loaded, weights, support), its result;
 // write(p, loaded, result), with a result of zeros where positions are not those of the activation; skip(p) for a
-// particle outside. If particles may be displaced, that is, in active blocks other than those of the activation,
-// write(...) returns their new place, and there are counters of the displacement. With `Others`, that many channels of
-// the nodes `others` have a separate support, the last argument of compute(...). If it has a test whether an activation
-// is due, particles are in the order of items, except for one activation. If it may load ahead, it states whether the
-// previous kernel writes only nodes.
+// particle outside. Particles may be displaced, that is, in active blocks other than those of the activation. If there
+// are counters of the displacement, write(...) returns the new place of the particle, which is followed. With `Others`,
+// that many channels of the nodes `others` have a separate support, the last argument of compute(...). If it has a test
+// whether an activation is due, particles are in the order of items, except for one activation. If it may load ahead,
+// it states whether the previous kernel writes only nodes.
 template <class Task>
 constexpr bool may_be_displaced = requires { requires Task::displaced; };
+template <class Task>
+constexpr bool is_followed = may_be_displaced<Task> && requires(const Task& task) { task.displacement; };
 template <class Task>
 constexpr int kOthers = 0;
 template <class Task>
@@ -358,7 +360,7 @@ __device__ void gather_in_memory_order(const Task& task, const Schedule<const in
       task.skip(p);
       continue;
     }
-    if constexpr (may_be_displaced<Task>) {
+    if constexpr (is_followed<Task>) {
       const Vector<T, D> to = gather_from_grid<Quads>(task, schedule, p, scene, slot, support, f);
       BaseBlock<T, D> home;
       home.template set<Task::Order>(t, base_block);
@@ -409,7 +411,10 @@ __device__ void gather_out_of_block(const Task& task, const Schedule<const int>&
       task.skip(p);
       continue;
     }
-    follower.follow(t, home, active, gather_from_grid<Quads>(task, schedule, p, home.scene, slot, support, f));
+    if constexpr (is_followed<Task>)
+      follower.follow(t, home, active, gather_from_grid<Quads>(task, schedule, p, home.scene, slot, support, f));
+    else
+      gather_from_grid<Quads>(task, schedule, p, home.scene, slot, support, f);
   }
 }
 
@@ -437,7 +442,7 @@ __device__ void gather_by_items(const Task& task, const Schedule<const int>& sch
     if (threadIdx.x < 1 << D) slots[threadIdx.x] = schedule.neighbours[(item.x << D) + threadIdx.x];
     if (may_be_displaced<Task> && threadIdx.x == 32) home.template set<Task::Order>(t, base_block);
     if (may_be_displaced<Task> && threadIdx.x == 64) out_of_block.count = 0;
-    const unsigned active = may_be_displaced<Task> ? FollowerOf<Task>::active_blocks(t, item.x) : 0;
+    const unsigned active = is_followed<Task> ? FollowerOf<Task>::active_blocks(t, item.x) : 0;
     typename Task::Loaded loaded;
     if constexpr (may_load_ahead<Task>) loaded = task.load(p, scene);
     __syncthreads();
@@ -463,12 +468,16 @@ __device__ void gather_by_items(const Task& task, const Schedule<const int>& sch
         else
           return task.compute(loaded, weights, support);
       }();
-      if constexpr (!may_be_displaced<Task>)
+      if constexpr (!may_be_displaced<Task>) {
         task.write(p, loaded, in_block ? result : typename Task::Result{});
-      else if (in_block)
-        follower.follow(t, home, active, task.write(p, loaded, result));
-      else
+      } else if (in_block) {
+        if constexpr (is_followed<Task>)
+          follower.follow(t, home, active, task.write(p, loaded, result));
+        else
+          task.write(p, loaded, result);
+      } else {
         out_of_block.particle[atomicAdd(&out_of_block.count, 1)] = uint16_t(k - begin);
+      }
       p = p_next;
       p_next = p_after;
       x = x_next;
@@ -496,7 +505,7 @@ __global__ void __launch_bounds__(kGatherThreads, kResident<Task>) gather_kernel
   } else {
     gather_by_items<Quads>(task, schedule, follower);
   }
-  if constexpr (may_be_displaced<Task>) follower.flush_counters(task.displacement);
+  if constexpr (is_followed<Task>) follower.flush_counters(task.displacement);
 }
 
 template <class Task, class Kernel>

@@ -43,7 +43,7 @@ class CudaCall {
 
   void run() {
     if (schedule_ == kBlockPerScene) return run_block_per_scene();
-    if (in_.n > 1 && !heat_) s_.let_activations_last(stream_);  // heat needs the base blocks of all particles
+    if (in_.n > 1) s_.let_activations_last(stream_);
     s_.fuse(false);
     s_.make_pool(stream_);
     s_.count_time(before_, stream_);
@@ -140,8 +140,9 @@ class CudaCall {
     if (thermal_) thermal_->read(field<T>(F_[1 - into]), field<T>(J_[1 - into]));
     if (late_) s_.move_late(to, step_ > 0, last);
     s_.activate(before_, status(into), on);
-    if (heat_) heat_->begin(from_.F, from_.J, s_.p2g.volume, on);
+    if (heat_ && heat_->begins()) heat_->begin(from_.F, from_.J, s_.p2g.volume, on);
     thermal_ ? thermal_->run(on) : s_.run_laws(on);
+    if (heat_) heat_->use_g2p();
     s_.move(on);
     if (heat_) {
       const Field<const int> scene{s_.activation.scene, {s_.activation.scene_stride}};
