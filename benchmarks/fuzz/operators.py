@@ -239,7 +239,7 @@ class _Calls:
         return [
             ("substeps", call),
             ("substeps", with_heat),
-            ("substeps_backward", (*grads, torch.ones_like(impulse), 15, None, *call)),
+            ("substeps_backward", ([*grads, torch.ones_like(impulse)], 15, None, *call)),
             ("law_figures", figures),
             ("plan_substeps", (-1, *facts)),
             ("latest_schedule", (self.x,)),

@@ -374,18 +374,20 @@ void set(Tensor& adjoint, const OptionalTensor& grad, const char* name, const Te
 using Gradients =
     std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
-Gradients substeps_backward(const OptionalTensor& grad_x, const OptionalTensor& grad_v, const OptionalTensor& grad_C,
-                            const OptionalTensor& grad_F, const OptionalTensor& grad_J,
-                            const OptionalTensor& grad_history, const OptionalTensor& grad_impulse, int64_t needs,
-                            const OptionalTensor& record, MPM_SUBSTEPS_PARAMETERS) {
+// The list of the adjoints of the results. An op has at most 64 arguments, the bits of the dispatcher.
+enum Result : size_t { kX, kV, kC, kF, kJ, kHistory, kImpulse, kResults };
+
+Gradients substeps_backward(const std::vector<OptionalTensor>& grads, int64_t needs, const OptionalTensor& record,
+                            MPM_SUBSTEPS_PARAMETERS) {
   const SubstepsInputs in{MPM_SUBSTEPS_ARGUMENTS};
   check_positions(x);
+  STD_TORCH_CHECK(grads.size() == kResults, "grads must have ", size_t(kResults), " entries, got ", grads.size());
   const int64_t P = x.size(0);
   Adjoints adjoints;
   GridSums sums;
   const DeviceScope device(x);
   dispatch(x, [&]<class T, int D>() {
-    SubstepsBackward<T, D> backward(in, grad_impulse, record, needs, device.stream());
+    SubstepsBackward<T, D> backward(in, grads[kImpulse], record, needs, device.stream());
     adjoints.x = empty_particles(x, {P, D});
     adjoints.v = empty_particles(x, {P, D});
     adjoints.C = empty_particles(x, {P, D, D});
@@ -396,12 +398,12 @@ Gradients substeps_backward(const OptionalTensor& grad_x, const OptionalTensor& 
     adjoints.volume = result(x, needs & kVolume, {P});
     adjoints.parameters = result(x, needs & kParameters_, {P, int64_t(parameters.size())});
     adjoints.dt = result(x, needs & kTimeStep, {P});
-    set(adjoints.x, grad_x, "grad_x", x);
-    set(adjoints.v, grad_v, "grad_v", x);
-    set(adjoints.C, grad_C, "grad_C", x);
-    set(adjoints.F, grad_F, "grad_F", x);
-    set(adjoints.J, grad_J, "grad_J", x);
-    set(adjoints.history, grad_history, "grad_history", x);
+    set(adjoints.x, grads[kX], "grad_x", x);
+    set(adjoints.v, grads[kV], "grad_v", x);
+    set(adjoints.C, grads[kC], "grad_C", x);
+    set(adjoints.F, grads[kF], "grad_F", x);
+    set(adjoints.J, grads[kJ], "grad_J", x);
+    set(adjoints.history, grads[kHistory], "grad_history", x);
     for (Tensor* sum : {&adjoints.mass, &adjoints.volume, &adjoints.parameters, &adjoints.dt}) set(*sum, {}, "", x);
     if ((needs & kGravity) && has(gravity)) sums.gravity = zeros(x, {backward.blocks(), D});
     if ((needs & kObstacles) && has(obstacle_table)) sums.obstacles = zeros(x, sizes_of(*obstacle_table));
@@ -418,8 +420,7 @@ Gradients substeps_backward(const OptionalTensor& grad_x, const OptionalTensor& 
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
 STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
   m.def(
-      "substeps_backward(Tensor? grad_x, Tensor? grad_v, Tensor? grad_C, Tensor? grad_F, Tensor? grad_J, "
-      "Tensor? grad_history, Tensor? grad_impulse, int needs, Tensor? record, " MPM_SUBSTEPS_SCHEMA
+      "substeps_backward(Tensor?[] grads, int needs, Tensor? record, " MPM_SUBSTEPS_SCHEMA
       ") -> (Tensor x, Tensor v, Tensor C, Tensor F, Tensor J, Tensor history, Tensor mass, Tensor volume, "
       "Tensor parameters, Tensor gravity, Tensor obstacles, Tensor dt)");
 }

@@ -60,12 +60,12 @@ Differentiable once, with respect to x, v, mass, volume, C, F, J, history, param
 scene_dt, the last without FLIP and without the dependence of obstacles on the time. Autograd stores the arguments of a
 call and the record, if any: 2 D + 2 D² numbers per particle of a solid (24 in 3-D) and its history.
 
-    torch.ops.torch_mpm.substeps_backward(grad_x, grad_v, grad_C, grad_F, grad_J, grad_history, grad_impulse, needs,
-        record, *arguments of substeps)
+    torch.ops.torch_mpm.substeps_backward(grads, needs, record, *arguments of substeps)
         -> (x, v, C, F, J, history, mass, volume, parameters, gravity, obstacles, dt)
 
 recomputes the steps, where there is no record, and then computes their adjoints in reverse order; a record must be that
-of `substeps`, and its contents are not checked. Meanwhile it stores the inputs of each step: for a solid 2 D + 3 D²
+of `substeps`, and its contents are not checked. `grads` are the adjoints of the results x, v, C, F, J, history and
+impulse, None where they are zero: one list, since an op has at most 64 arguments. Meanwhile it stores the inputs of each step: for a solid 2 D + 3 D²
 numbers per particle and step (33 in 3-D), D² more where a law is plastic, and the history; and the grid of each step
 where that is at most half as much. The adjoints are [P, ...], those of the parameters [P, number of parameters] and
 that of gravity, over the time step, a sum for each block of the grids of all scenes [B * blocks, D]; that of the time
@@ -148,7 +148,7 @@ def _latest_schedule_fake(like):
 
 
 @torch.library.register_fake("torch_mpm::substeps_backward")
-def _backward_fake(grad_x, grad_v, grad_C, grad_F, grad_J, grad_history, grad_impulse, needs, record, *arguments):
+def _backward_fake(grads, needs, record, *arguments):
     given = dict(zip(_SCHEMA, arguments, strict=False))
     x, history = given["x"], given["history"]
     P, D = sizes(x, "x", 2)
@@ -191,7 +191,7 @@ def _backward(ctx: Any, *grads: Any) -> Any:
     by_impulse = None if grads[7] is None else grads[7].contiguous()
     arguments = (given[name] for name in _SCHEMA)
     op = torch.ops.torch_mpm.substeps_backward
-    adjoints = interruptible(dispatch, op, *grads[:6], by_impulse, needs, record, *arguments)
+    adjoints = interruptible(dispatch, op, [*grads[:6], by_impulse], needs, record, *arguments)
     found = dict(zip(_ADJOINTS, adjoints, strict=True)) | {"impulse": grads[7], "heat": [None] * len(given["heat"])}
     found["heat_boundaries"] = [None] * len(given["heat_boundaries"])
     found["tables"] = [None] * len(given["tables"])
