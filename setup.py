@@ -252,7 +252,7 @@ def parts(sources: Iterable[Path]) -> list[tuple[Path, list[str]]]:
     shapes = [[*scalar, f"-DMPM_DIMENSION={dimension}"] for scalar in scalars for dimension in (2, 3)]
     headers = sorted(h for h in (CSRC / "laws").glob("*.h") if "\nMPM_REGISTER_LAW(" in h.read_text())
     each_law = [[f'-DMPM_LAW_HEADER="laws/{header.name}"'] for header in headers]
-    names = ("gather.cu", "scatter.cu", "heat.cu", "heat_operator.cu", "tangent_gather.cu", "transfer.cu")
+    names = "backward.cu", "gather.cu", "scatter.cu", "heat.cu", "heat_operator.cu", "tangent_gather.cu", "transfer.cu"
     split = dict.fromkeys(names, shapes)
     split |= {"g2p_advance.cu": scalars, "law.cpu.cpp": each_law, "law.cu": each_law, "fused_law.cu": each_law}
     return [(source, part) for source in sorted(sources) for part in split.get(source.name, [[]])]

@@ -228,7 +228,7 @@ class _Calls:
         heat = [self.uniform(P), ones, ones, self.uniform(P), ones, 1 + self.uniform(2), self.normal(P, D)]
         bounds = [self.normal(2, 2), self.uniform(3, 2, 2), self.uniform(P)]
         table = torch.stack([torch.arange(3, dtype=self.dtype), 1 + self.uniform(3)])
-        conducts = (heat, [0, 9, 1], [1e-3, 273.0, 0.5], [1, 0], [0, 1, 2], bounds, [0, 1, 0], [table])
+        conducts = (heat, [0, 9, 1], [1e-3, 273.0, 0.5, 1e-6], [1, 0], [0, 1, 2], bounds, [0, 1, 0], [table])
         hot = (*self.obstacles, 0.1, 2, 40, True, True, False, None, *clocks, *conducts)
         look = (*fields[:5], self.F, *self.uniform(4, P), self.scene, 50.0, 2.0, True, 0.1, self.lattice.upper, 2)
         start = (*fields, 0.5 + self.uniform(P), None, [self.uniform(P)], *who, *laws, *how)

@@ -1,6 +1,7 @@
 #pragma once
 
 #include "common/backend.h"
+#include "heat/backward.h"
 #include "heat/patches.h"
 #include "heat/solve.h"
 #include "heat/transfer.h"
@@ -28,3 +29,9 @@ MPM_BACKEND_KERNELS(MPM_HEAT_KERNELS)
   PLAIN(heat_count, HeatCountArguments)                 \
   ORDERED(heat_to_particles, HeatToParticlesArguments)
 MPM_BACKEND_KERNELS(MPM_HEAT_TRANSFER_KERNELS)
+
+#define MPM_HEAT_BACKWARD_KERNELS(PLAIN, ORDERED, SIZE)                 \
+  ORDERED(heat_to_particles_backward, HeatToParticlesBackwardArguments) \
+  PLAIN(heat_nodes_backward, HeatNodesBackwardArguments)                \
+  ORDERED(heat_to_nodes_backward, HeatToNodesBackwardArguments)
+MPM_BACKEND_KERNELS(MPM_HEAT_BACKWARD_KERNELS)

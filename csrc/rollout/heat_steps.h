@@ -10,6 +10,14 @@
 // laws; after G2P, with the positions before it: sums on the nodes, the solve, and the temperature of the particles.
 namespace mpm {
 
+// The node temperatures of a step: the transfer to the nodes, the system, and the results of its solve.
+template <class T, int D>
+struct HeatSolution {
+  HeatToNodesArguments<T, D> down;
+  HeatArguments<T, D> system;
+  const T* theta;  // averages of the nodes [N]
+};
+
 template <class T, int D>
 class HeatSteps {
  public:
@@ -46,6 +54,17 @@ class HeatSteps {
   // Computes the temperatures after a substep, with positions before it and the velocity gradient after it.
   void run(const Field<const T>& x, const Field<const T>& mass, const Field<const T>& rest,
            const Field<const T>& velocity_gradient, const Field<const int>& scene, backend::Stream stream) {
+    const HeatSolution<T, D> solution = conduct(x, mass, rest, velocity_gradient, scene, stream);
+    HeatToParticlesArguments<T, D> up = to_particles(solution.down);
+    backend::heat_to_particles(in_.lattice.order(), up, stream);
+    fields.go(true);
+    count(scene, stream);
+  }
+
+  // The part of a substep up to the node temperatures.
+  HeatSolution<T, D> conduct(const Field<const T>& x, const Field<const T>& mass, const Field<const T>& rest,
+                             const Field<const T>& velocity_gradient, const Field<const int>& scene,
+                             backend::Stream stream) {
     make_nodes(stream);
     HeatToNodesArguments<T, D> down = to_nodes(x, mass, velocity_gradient);
     backend::heat_to_nodes(in_.lattice.order(), down, stream);
@@ -53,16 +72,25 @@ class HeatSteps {
     if (holds_surface()) add_layers(x, scene, stream);
     means(stream);
     if (has_terms()) add_terms(x, rest, stream);
-    solve(x, scene, stream);
-    HeatToParticlesArguments<T, D> up = to_particles(down);
-    backend::heat_to_particles(in_.lattice.order(), up, stream);
-    fields.go(true);
-    count(scene, stream);
+    return {down, solve(x, scene, stream), static_cast<const T*>(theta_.data_ptr())};
   }
+
+  // The transfer of these temperatures to the particles.
+  HeatToParticlesArguments<T, D> to_particles(const HeatToNodesArguments<T, D>& down);
+
+  // The first columns of the fields, which a call returns and a step reads.
+  int state_columns() const { return volume_; }
+  Tensor state() const {
+    Tensor all = fields.tensor();
+    return torch::stable::narrow(all, 1, 0, volume_);
+  }
+  bool melts() const { return liquid_ >= 0; }
+  // The columns of a tensor in the order of the fields.
+  static Field<T> column_of(const Tensor& t, int first) { return column(field<T>(t), first); }
+  int gradient_column() const { return gradient_; }
 
  private:
   int64_t particles() const { return in_.x.size(0); }
-  bool melts() const { return liquid_ >= 0; }
   int64_t held_nodes() const { return int64_t(in_.held_obstacles.size()) - holds_surface(); }
   // The last of the held obstacles is held at its surface, the others at the nodes in them.
   bool holds_surface() const { return in_.heat_options[2] != 0; }
@@ -97,8 +125,7 @@ class HeatSteps {
   void make_nodes(backend::Stream stream);
   HeatToNodesArguments<T, D> to_nodes(const Field<const T>& x, const Field<const T>& mass,
                                       const Field<const T>& velocity_gradient) const;
-  HeatToParticlesArguments<T, D> to_particles(const HeatToNodesArguments<T, D>& down);
-  void solve(const Field<const T>& x, const Field<const int>& scene, backend::Stream stream);
+  HeatArguments<T, D> solve(const Field<const T>& x, const Field<const int>& scene, backend::Stream stream);
   void find_largest(const Field<const T>& of, const Field<const int>& scene, double* to, int64_t stride,
                     backend::Stream stream) const;
   void count(const Field<const int>& scene, backend::Stream stream);
@@ -118,6 +145,16 @@ class HeatSteps {
   Tensor sums_, theta_, capacity_, increment_, iterations_, residual_, converged_, workspace_;
 };
 
+// The adjoint has no boundaries of heat, no heating by laws, and no laws that read temperatures
+// (torch_mpm/rollouts/fused_heat.py).
+inline void check_heat_has_gradients(const SubstepsInputs& in) {
+  const bool heats_by_laws = in.heat_scalars.size() > 2 && in.heat_scalars[2] > 0;
+  STD_TORCH_CHECK(
+      in.heat_boundaries.empty() && in.thermal.empty() && !heats_by_laws && in.laws.find('~') == std::string::npos,
+      "heat with boundaries, plastic heating or laws that read the temperature is computed without "
+      "gradients: records must be false, and resident true");
+}
+
 template <class T, int D>
 HeatSteps<T, D>::HeatSteps(Substeps<T, D>& steps) : s_(steps), in_(steps.in) {
   const Tensor& x = in_.x;
@@ -125,7 +162,7 @@ HeatSteps<T, D>::HeatSteps(Substeps<T, D>& steps) : s_(steps), in_(steps.in) {
   const size_t tensors = in_.heat.size() - has_gradient();
   STD_TORCH_CHECK(tensors == 3 || tensors == 6, "heat must be 3 or 6 tensors, and the gradient, got ", in_.heat.size());
   STD_TORCH_CHECK(in_.heat_options.size() == 3, "heat_options must have 3 entries, got ", in_.heat_options.size());
-  STD_TORCH_CHECK(in_.heat_scalars.size() == 3, "heat_scalars must have 3 entries, got ", in_.heat_scalars.size());
+  STD_TORCH_CHECK(in_.heat_scalars.size() == 4, "heat_scalars must have 4 entries, got ", in_.heat_scalars.size());
   STD_TORCH_CHECK(in_.heat_scalars[2] >= 0 && in_.heat_scalars[2] <= 1,
                   "the share of plastic heating must be 0 to 1, got ", in_.heat_scalars[2]);
   STD_TORCH_CHECK(in_.heat_boundaries.empty() || in_.heat_boundaries.size() == kBoundaries,
@@ -134,8 +171,9 @@ HeatSteps<T, D>::HeatSteps(Substeps<T, D>& steps) : s_(steps), in_(steps.in) {
                   "the transfer of heat must be 0 to 3, got ", in_.heat_options[0]);
   STD_TORCH_CHECK(in_.heat_options[1] > 0 && in_.heat_options[1] <= INT32_MAX,
                   "the number of iterations must be positive, got ", in_.heat_options[1]);
-  STD_TORCH_CHECK(in_.heat_scalars[0] > 0 && in_.heat_scalars[0] < 1, "the tolerance must be between 0 and 1, got ",
-                  in_.heat_scalars[0]);
+  for (const size_t k : {0, 3})
+    STD_TORCH_CHECK(in_.heat_scalars[k] > 0 && in_.heat_scalars[k] < 1, "the ", k == 0 ? "" : "adjoint ",
+                    "tolerance must be between 0 and 1, got ", in_.heat_scalars[k]);
   STD_TORCH_CHECK(in_.wants_C, "heat needs wants_C");
   STD_TORCH_CHECK(s_.p2g.form == StressForm::mls, "heat needs the stress form mls");
   pack();
@@ -390,7 +428,8 @@ void HeatSteps<T, D>::add_terms(const Field<const T>& x, const Field<const T>& r
 }
 
 template <class T, int D>
-void HeatSteps<T, D>::solve(const Field<const T>& x, const Field<const int>& scene, backend::Stream stream) {
+HeatArguments<T, D> HeatSteps<T, D>::solve(const Field<const T>& x, const Field<const int>& scene,
+                                           backend::Stream stream) {
   const int64_t nodes = slots_ * kBlockNodes<D>;
   T* const sums = static_cast<T*>(sums_.data_ptr());
   T* const theta = static_cast<T*>(theta_.data_ptr());
@@ -423,6 +462,7 @@ void HeatSteps<T, D>::solve(const Field<const T>& x, const Field<const int>& sce
   a.workspace = workspace_.data_ptr();
   backend::heat_cg(in_.lattice.order(), a, stream);
   backend::heat_increments(HeatIncrementsArguments<T, D>{nodes, a.increment, a.theta, theta, sums}, stream);
+  return a;
 }
 
 // Adds the solves and fronts of a substep to the status.

@@ -1,10 +1,11 @@
 #pragma once
 
 #include "common/signals.h"
+#include "rollout/heat_steps.h"
 #include "rollout/step_kernels.h"
 
-// n steps with a record of the inputs of their adjoints: the particles of each step, and its active blocks and nodes if
-// these need less memory than the particles.
+// n steps with a record of the inputs of their adjoints: the particles of each step with their heat, and its active
+// blocks and nodes if these need less memory than the particles.
 namespace mpm {
 
 // Consecutive pieces of one tensor of bytes; without a tensor the bytes are only counted.
@@ -84,8 +85,10 @@ template <class T, int D>
 class Recorded {
  public:
   Substeps<T, D> steps;
+  std::optional<HeatSteps<T, D>> heat;
   Record<T> x, v, C, F, J, residual, history, stress;
-  Record<T> mapped;  // F after the return maps
+  Record<T> mapped;      // F after the return maps
+  Record<T> heat_after;  // temperature, gradient and liquid fraction
 
   // In `memory`, filled by an earlier `run`, or in new memory.
   Recorded(const SubstepsInputs& in, const OptionalTensor& memory, backend::Stream stream);
@@ -96,6 +99,14 @@ class Recorded {
   // Restores the state after the grid update of step i, which is the last step, or precedes the step of the last call.
   // False as for `run`.
   bool return_to(int64_t i);
+
+  // Computes the node temperatures of that step again.
+  HeatSolution<T, D> conduct_again(int64_t i) {
+    Tensor before = heat->state();
+    torch::stable::copy_(before, i == 0 ? first_heat_ : heat_after.vector(i - 1));
+    heat->begin(state(i).F, state(i).J, steps.p2g.volume, stream_);
+    return heat->conduct(state(i).x, steps.p2g.mass, steps.p2g.volume, constant(C[i]), scene_of_particles(), stream_);
+  }
 
   // The whole record in one tensor; undefined if a pool has outgrown it.
   Tensor memory() const { return steps.activation.max_blocks == in_.max_blocks ? memory_ : Tensor(); }
@@ -159,6 +170,14 @@ class Recorded {
     if (scene_times_.defined()) steps.contact.scene_time = scene_time(i);
   }
 
+  Field<const int> scene_of_particles() const { return {steps.activation.scene, {steps.activation.scene_stride}}; }
+
+  void conduct_heat(int64_t i) {
+    heat->run(state(i).x, steps.p2g.mass, steps.p2g.volume, constant(C[i]), scene_of_particles(), stream_);
+    Tensor to = heat_after.vector(i);
+    torch::stable::copy_(to, heat->state());
+  }
+
   bool activate(int64_t i) { return steps.activate(i == 0 && !goes_on_ ? nullptr : status(i - 1), status(i), stream_); }
 
   // Copies the fields that a law of a mixture writes only for its own particles.
@@ -188,7 +207,7 @@ class Recorded {
 
   const SubstepsInputs& in_;
   backend::Stream stream_;
-  Tensor first_history_, memory_, workspace_, scene_times_;
+  Tensor first_history_, first_heat_, memory_, workspace_, scene_times_;
   Particles<const T> first_;
   std::vector<double> time_;
   const ObstacleRow<T, D>* first_row_;
@@ -211,6 +230,10 @@ Recorded<T, D>::Recorded(const SubstepsInputs& in, const OptionalTensor& memory,
   while (int64_t(time_.size()) < in.n) time_.push_back(time_.back() + in.dt);
   first_history_ = packed_history(in.x, in.history, steps.columns);
   first_ = given_particles<T, D>(in, first_history_);
+  if (HeatSteps<T, D>::wanted(in)) {
+    heat.emplace(steps);
+    first_heat_ = copy_of(heat->state());
+  }
   steps.forget_stress();  // each step has its own stress
   steps.fuse(true);
   steps.activation.workspace_size = backend::activate_workspace(steps.activation, stream);
@@ -259,6 +282,7 @@ void Recorded<T, D>::lay_out(Arena& arena) {
   if (steps.columns > 0) history = Record<T>(arena, given, n, steps.columns);
   stress = Record<T>(arena, given, n, D, D);
   if (steps.plastic) mapped = Record<T>(arena, given, n, D, D);
+  if (heat) heat_after = Record<T>(arena, given, n, heat->state_columns());
   status_ = arena.take<int>((1 + n) * (1 + in_.scenes) * kStatusSize);
   if (!keeps_grids_) return;
   const Shape nodes = Pool<T, D>::nodes_shape(steps.activation);
@@ -292,8 +316,10 @@ bool Recorded<T, D>::run() {
     if (!memory().defined()) keeps_grids_ = steps.nodes_are_clear = false;  // all steps share the grown pool
     steps.write({x[i], v[i], C[i], F[i], J[i], residual[i], history[i]});
     if (has(in_.material)) keep_others(i);
+    if (heat) heat->begin(state(i).F, state(i).J, steps.p2g.volume, stream_);
     steps.run_laws(stream_);
     steps.move(stream_);
+    if (heat) conduct_heat(i);
     steps.end_time(stream_);
     after_substeps(in_.x.size(0), 1, stream_);
   }

@@ -1,4 +1,5 @@
 #include "common/team.h"
+#include "rollout/heat_backward.h"
 #include "rollout/recorded.h"
 
 // The adjoint of n steps in one call. The steps are recomputed with a record of the inputs of each, unless the forward
@@ -11,12 +12,22 @@ namespace {
 // Adjoints per particle; absent ones are undefined.
 struct Adjoints {
   Tensor x, v, C, F, J, history, mass, volume;
-  Tensor parameters;  // [P, n], of all laws
-  Tensor dt;          // [P], with respect to dt * scene_dt, without gravity
+  Tensor parameters;             // [P, n], of all laws
+  Tensor dt;                     // [P], with respect to dt * scene_dt, without gravity
+  Tensor heat, heat_parameters;  // [P, m] in the order of the result, [P, kHeatParameters]
+  Tensor heat_status;            // of the adjoint solves
 };
 
 // Bits of `needs`, in the order of the returned tensors after those of the state.
-enum Need : int64_t { kMass = 1, kVolume = 2, kParameters_ = 4, kGravity = 8, kObstacles = 16, kTimeStep = 32 };
+enum Need : int64_t {
+  kMass = 1,
+  kVolume = 2,
+  kParameters_ = 4,
+  kGravity = 8,
+  kObstacles = 16,
+  kTimeStep = 32,
+  kHeatParameters_ = 64
+};
 
 // Adjoints summed over the grid, undefined if not wanted: of gravity, by blocks of the domain, and of the table of
 // obstacles.
@@ -33,6 +44,7 @@ class SubstepsBackward {
 
   int64_t columns() const { return s_.columns; }  // of the history of all laws
   int64_t blocks() const { return s_.update.block_count; }
+  int64_t heat_columns() const { return r_.heat ? r_.heat->state_columns() : 0; }
 
   // The adjoints of the final state become those of the initial state; the others are accumulated.
   void run(Adjoints& adjoints, const GridSums& sums) {
@@ -45,19 +57,28 @@ class SubstepsBackward {
     if (sums.gravity.defined()) change_ = empty(in_.x, {slots, D});
     if (sums.obstacles.defined()) row_grad_ = empty(in_.x, {slots, s_.contact.obstacles, ObstacleRow<T, D>::width});
     if (s_.flips()) before_ = empty(in_.x, {3, rows, 1 + D});
+    std::optional<HeatBackward<T, D>> heat;
+    if (r_.heat) heat.emplace(r_, in_, stream_);
     for (int64_t i = in_.n - 1; i >= 0; i--) {
       check_room(r_.return_to(i));
       if (s_.flips()) keep_adjoint(adjoints);
+      if (heat) heat->run(i, heat_adjoints(adjoints));
       backward_advance(i, adjoints);
       backward_grid(i, adjoints, sums);
       if (s_.flips()) backward_kept(adjoints);
       backward_laws(adjoints);
+      if (heat) add_terms({{adjoints.x, heat->x_term}, {adjoints.F, heat->F_term}, {adjoints.J, heat->J_term}});
       if (adjoints.dt.defined()) add_terms({{adjoints.dt, motion_dt_}, {adjoints.dt, stress_dt_}});
       after_substeps(in_.x.size(0), 1, stream_);
     }
   }
 
  private:
+  // Those of the heat of a step, which adds to the adjoint of the velocity gradient after the step.
+  static HeatAdjoints heat_adjoints(const Adjoints& a) {
+    return {a.heat, a.heat_parameters, a.C, a.mass, a.volume, a.dt, a.heat_status};
+  }
+
   // The adjoints of the motion of the nodes in a step.
   T* motion_of(int64_t i) const { return static_cast<T*>(motion_.data_ptr()) + i % motions_ * motion_.stride(0); }
 
@@ -371,16 +392,17 @@ void set(Tensor& adjoint, const OptionalTensor& grad, const char* name, const Te
   torch::stable::copy_(adjoint, *grad);
 }
 
-using Gradients =
-    std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
+using Gradients = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor,
+                             Tensor, Tensor, Tensor, Tensor>;
 
 // The list of the adjoints of the results. An op has at most 64 arguments, the bits of the dispatcher.
-enum Result : size_t { kX, kV, kC, kF, kJ, kHistory, kImpulse, kResults };
+enum Result : size_t { kX, kV, kC, kF, kJ, kHistory, kImpulse, kHeat, kResults };
 
 Gradients substeps_backward(const std::vector<OptionalTensor>& grads, int64_t needs, const OptionalTensor& record,
                             MPM_SUBSTEPS_PARAMETERS) {
   const SubstepsInputs in{MPM_SUBSTEPS_ARGUMENTS};
   check_positions(x);
+  check_heat_has_gradients(in);
   STD_TORCH_CHECK(grads.size() == kResults, "grads must have ", size_t(kResults), " entries, got ", grads.size());
   const int64_t P = x.size(0);
   Adjoints adjoints;
@@ -398,20 +420,35 @@ Gradients substeps_backward(const std::vector<OptionalTensor>& grads, int64_t ne
     adjoints.volume = result(x, needs & kVolume, {P});
     adjoints.parameters = result(x, needs & kParameters_, {P, int64_t(parameters.size())});
     adjoints.dt = result(x, needs & kTimeStep, {P});
+    if (const int64_t columns = backward.heat_columns(); columns > 0) {
+      adjoints.heat = empty_particles(x, {P, columns});
+      adjoints.heat_parameters = result(x, needs & kHeatParameters_, {P, int64_t(kHeatParameters)});
+      adjoints.heat_status = empty(x, {in.scenes, int64_t(kHeatStatusSize)}, ScalarType::Double);
+      torch::stable::zero_(adjoints.heat_status);
+    }
     set(adjoints.x, grads[kX], "grad_x", x);
     set(adjoints.v, grads[kV], "grad_v", x);
     set(adjoints.C, grads[kC], "grad_C", x);
     set(adjoints.F, grads[kF], "grad_F", x);
     set(adjoints.J, grads[kJ], "grad_J", x);
     set(adjoints.history, grads[kHistory], "grad_history", x);
-    for (Tensor* sum : {&adjoints.mass, &adjoints.volume, &adjoints.parameters, &adjoints.dt}) set(*sum, {}, "", x);
+    set(adjoints.heat, grads[kHeat], "grad_heat", x);
+    for (Tensor* sum :
+         {&adjoints.mass, &adjoints.volume, &adjoints.parameters, &adjoints.dt, &adjoints.heat_parameters})
+      set(*sum, {}, "", x);
     if ((needs & kGravity) && has(gravity)) sums.gravity = zeros(x, {backward.blocks(), D});
     if ((needs & kObstacles) && has(obstacle_table)) sums.obstacles = zeros(x, sizes_of(*obstacle_table));
     if (P > 0) with_team(P * n, [&] { backward.run(adjoints, sums); });
   });
   if (!has(C)) adjoints.C = Tensor();
-  return {adjoints.x,    adjoints.v,      adjoints.C,          adjoints.F,   adjoints.J,     adjoints.history,
-          adjoints.mass, adjoints.volume, adjoints.parameters, sums.gravity, sums.obstacles, adjoints.dt};
+  return {adjoints.x,          adjoints.v,
+          adjoints.C,          adjoints.F,
+          adjoints.J,          adjoints.history,
+          adjoints.mass,       adjoints.volume,
+          adjoints.parameters, sums.gravity,
+          sums.obstacles,      adjoints.dt,
+          adjoints.heat,       adjoints.heat_parameters,
+          adjoints.heat_status};
 }
 
 }  // namespace
@@ -419,10 +456,10 @@ Gradients substeps_backward(const std::vector<OptionalTensor>& grads, int64_t ne
 
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
 STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
-  m.def(
-      "substeps_backward(Tensor?[] grads, int needs, Tensor? record, " MPM_SUBSTEPS_SCHEMA
-      ") -> (Tensor x, Tensor v, Tensor C, Tensor F, Tensor J, Tensor history, Tensor mass, Tensor volume, "
-      "Tensor parameters, Tensor gravity, Tensor obstacles, Tensor dt)");
+  m.def("substeps_backward(Tensor?[] grads, int needs, Tensor? record, " MPM_SUBSTEPS_SCHEMA
+        ") -> (Tensor x, Tensor v, Tensor C, Tensor F, Tensor J, Tensor history, Tensor mass, Tensor volume, "
+        "Tensor parameters, Tensor gravity, Tensor obstacles, Tensor dt, Tensor heat, Tensor heat_parameters, Tensor "
+        "heat_status)");
 }
 #endif
 

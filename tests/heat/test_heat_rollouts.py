@@ -5,6 +5,7 @@ import warnings
 
 import pytest
 import torch
+from heat_scenes import DT, LAWS, TRANSFERS, composed, scene
 from helpers import relative_error
 from pairs import in_pairs
 
@@ -13,51 +14,6 @@ from benchmarks.catalogue.laws import named
 from torch_mpm import heat_boundaries
 from torch_mpm.laws.parameters import PerMaterial
 from torch_mpm.rollouts import plan_rollout
-
-DT = 2e-4
-LAWS = ("neo_hookean", "fluid", "von_mises", "sand", "viscoelastic")
-TRANSFERS = ("hybrid", "apic", "flip", "pic")
-
-
-def scene(dim=3, dtype=torch.float64, scenes=1, law="neo_hookean", device="cpu", **options):
-    """A step and a state: a block in motion whose temperature varies, in an order that is not that of cells."""
-    g = torch.Generator().manual_seed(5)
-    melts, per_particle = options.pop("melts", False), options.pop("per_particle", False)
-    of_grid = {"kernel": options.pop("kernel", "quadratic"), "deterministic": options.pop("deterministic", False)}
-    grid = mpm.Grid(0.1, (0.0,) * dim, (1.0,) * dim, scenes, **of_grid)
-    points = mpm.seed.box((0.25,) * dim, (0.65,) * dim, grid, 2**dim, dtype=dtype)
-    x = points.x[torch.randperm(len(points.x), generator=g)].repeat(scenes, 1)
-    count = len(x)
-    ids = torch.arange(scenes, dtype=torch.int32).repeat_interleave(count // scenes) if scenes > 1 else None
-    given = mpm.seed.Points(x, points.volume[:1].expand(count).clone(), ids)
-    velocity = 2 * torch.rand(count, dim, generator=g, dtype=torch.float64) - 1
-    state = mpm.State.at_rest(given, 1000.0, dtype=dtype).replace(
-        v=velocity.to(dtype), temperature=(10 * x[:, 0].sin() + x[:, -1]).to(dtype)
-    )
-
-    def value(number):
-        if per_particle:
-            return number * (1 + torch.rand(count, generator=g, dtype=torch.float64).to(dtype))
-        return number * torch.linspace(1, 2, scenes, dtype=dtype) if scenes > 1 else number
-
-    melting = {"melting_point": value(3.0), "latent_heat": value(500.0)} if melts else {}
-    heat = mpm.Heat(
-        grid, value(2000.0), value(100.0), transfer=options.pop("transfer", "hybrid"), tolerance=1e-9, **melting
-    )
-    laws = list(named(*LAWS).values()) if law == "mixture" else [named(law)[law]]
-    if law == "mixture":
-        state = state.replace(material=(torch.arange(count) % len(laws)).int())
-    step = mpm.Step(
-        grid, mpm.Mixture([each() for each in laws]) if law == "mixture" else laws[0](), (0.0, -10.0, 0.0)[:dim],
-        "separate", boundaries=[mpm.Sphere((0.51, 0.22, 0.48)[:dim], 0.1, friction=0.2)], heat=heat, **options,
-    )  # fmt: skip
-    return step.to(device), step.prepare(state.to(device=device))
-
-
-def composed(step, state, n, dt):
-    for _ in range(n):
-        state = step(state, dt)
-    return state
 
 
 def compare(step, state, n=12, dt=DT, schedule=None, tolerance=1e-9):
@@ -502,22 +458,6 @@ def test_other_laws_that_read_the_temperature_go_step_by_step(reason):
     assert plan.executor == "loop" and reason in plan.reasons["fused"]
 
 
-@pytest.mark.parametrize("of", ["temperature", "v", "conductivity"])
-def test_gradients_go_step_by_step(of):
-    step, state = scene(2)
-    if of == "conductivity":
-        leaf = step.heat.conductivity = torch.tensor(2000.0, dtype=torch.float64, requires_grad=True)
-    else:
-        leaf = getattr(state, of).clone().requires_grad_()
-        state = state.replace(**{of: leaf})
-    plan = plan_rollout(step, state, 3, DT)
-    assert plan.executor == "loop" and "a gradient is wanted" in plan.reasons["fused"]
-    ends = [run(step, state, 3, DT) for run in (mpm.rollout, composed)]
-    grads = [torch.autograd.grad(end.temperature.square().sum(), leaf)[0] for end in ends]
-    assert float(grads[0].abs().max()) > 0
-    torch.testing.assert_close(*grads)
-
-
 def test_raw_op():
     step, state = scene(2, melts=True)
     arguments = mpm.substeps_arguments(step, state, 4, DT)
@@ -533,13 +473,14 @@ def test_raw_op():
         "heat.0. must have shape": {"heat": [heat[0][1:], *heat[1:]]},
         "the temperature gradient must have shape": {"heat": [*heat[:-1], state.x[1:]]},
         "heat_options must have 3 entries, got 2": {"heat_options": [0, 1]},
-        "heat_scalars must have 3 entries, got 1": {"heat_scalars": [0.5]},
-        "share of plastic heating must be 0 to 1, got 2": {"heat_scalars": [0.5, 0.0, 2.0]},
+        "heat_scalars must have 4 entries, got 1": {"heat_scalars": [0.5]},
+        "share of plastic heating must be 0 to 1, got 2": {"heat_scalars": [0.5, 0.0, 2.0, 0.5]},
         "transfer of heat must be 0 to 3, got 4": {"heat_options": [4, 9, 0]},
-        "tolerance must be between 0 and 1": {"heat_scalars": [1.0, 0.0, 0.0]},
+        "the tolerance must be between 0 and 1": {"heat_scalars": [1.0, 0.0, 0.0, 0.5]},
+        "the adjoint tolerance must be between 0 and 1": {"heat_scalars": [0.5, 0.0, 0.0, 0.0]},
         "iterations must be positive": {"heat_options": [0, 0, 0]},
         "heat needs wants_C": {"wants_C": False, "apic": False},
-        "without gradients": {"resident": False},
+        "without gradients": {"resident": False, "heat_boundaries": [none, none, none]},
         "heat_boundaries must be empty or 3 tensors, got 2": {"heat_boundaries": [none, none]},
         "held_obstacles must be 0 to 0, got 1": {
             "held_obstacles": [1],
@@ -568,7 +509,8 @@ def test_raw_op():
 
 
 @pytest.mark.parametrize("kind", [None, heat_boundaries.Fixed, heat_boundaries.FixedSurface])
-def test_gradients_of_paths_go_step_by_step(kind):
+def test_gradients_of_paths(kind):
+    """Heat without boundaries is differentiated by the op, other heat step by step."""
     ends = []
     for run in (mpm.rollout, composed):
         step, state = scene(2)
@@ -578,7 +520,8 @@ def test_gradients_of_paths_go_step_by_step(kind):
         if kind is not None:
             held(step, (kind, ball, 40.0))
         ends.append(torch.autograd.grad(run(step, state, 3, DT).temperature.square().sum(), leaf)[0])
-    assert "a gradient is wanted" in plan_rollout(step, state, 3, DT).reasons["fused"]
+    plan = plan_rollout(step, state, 3, DT)
+    assert plan.executor == "fused" if kind is None else "a gradient is wanted" in plan.reasons["fused"]
     assert float(ends[0].abs()) > 0
     torch.testing.assert_close(*ends)
 

@@ -19,8 +19,10 @@ from ..heat.boundaries import (
     Source,
 )
 from ..heat.heat import GRADIENT, TRANSFERS, Heat
+from ..laws.calls import laws_of, passive
 from ..laws.parameters import PerMaterial, check_length, evaluate, needed_temperature
 from ..laws.thermal import LIQUID
+from ..laws.thermal_calls import is_thermal
 from ..state.state import State
 from ..step.step import Step
 from .facts import wants_gradient
@@ -41,15 +43,21 @@ def why_not_fused_heat(step: Step, state: State, n: int, dt: float | Tensor) -> 
         return f"its heat is solved by {heat.method}"
     if step.stress_form != "mls":
         return "it conducts heat with another stress form than mls"
-    values = _values(heat)
-    if any(_is_function(value) for value in values):
+    if any(_is_function(value) for value in heat.parameter_values):
         return "a parameter of its heat is a function"
-    if torch.is_grad_enabled():
-        parts = [part for v in values for part in (v.values() if isinstance(v, PerMaterial) else (v,))]
-        if any(t.requires_grad for t in (*parts, *_fields(heat, state)) if isinstance(t, Tensor)) or wants_gradient(
-            Steps(step, n, dt), state
-        ):
-            return "it conducts heat, and a gradient is wanted"
+    if (reason := _why_no_adjoint(step, heat)) is not None and wants_gradient(Steps(step, n, dt), state):
+        return f"{reason}, and a gradient is wanted"
+    return None
+
+
+def _why_no_adjoint(step: Step, heat: Heat) -> str | None:
+    """Reason why the op has no gradients of the heat (`check_heat_has_gradients` in csrc/rollout); None if it has."""
+    if heat.boundaries.entries:
+        return "its heat has boundaries"
+    if heat.plastic_heating:
+        return "its heat has plastic heating"
+    if any(is_thermal(passive(law)) for law in laws_of(step.law)):
+        return "a law reads the temperature"
     return None
 
 
@@ -142,16 +150,6 @@ def _is_function(value: Any) -> bool:
     return callable(value) and not isinstance(value, Tensor)
 
 
-def _values(heat: Heat) -> tuple[Any, ...]:
-    """Parameters in the order of the op."""
-    melting = (heat.melting_point, heat.latent_heat) if heat.melts else ()
-    return (heat.conductivity, heat.specific_heat, *melting)
-
-
-def _fields(heat: Heat, state: State) -> tuple[Tensor | None, ...]:
-    return state.temperature, state.extra.get(GRADIENT), state.extra.get(LIQUID)
-
-
 def _tensor(name: str, value: Any, state: State, scenes: int) -> Tensor:
     """A parameter as the op takes it; values of particles in the order of the state.
 
@@ -171,7 +169,7 @@ def heat_arguments(step: Step, state: State) -> tuple[Any, ...]:
         return [], [], [], [], [], []
     temperature, scenes = needed_temperature(state), heat.grid.scenes
     names = ("conductivity", "specific_heat", "melting_point", "latent_heat")
-    values = [_tensor(name, v, state, scenes) for name, v in zip(names, _values(heat), strict=False)]
+    values = [_tensor(name, v, state, scenes) for name, v in zip(names, heat.parameter_values, strict=False)]
     melting = [state.extra[LIQUID], *values[2:]] if heat.melts else []
     gradient = [state.extra[GRADIENT]] if heat.affine else []
     numbers, surface, temperatures = _held(step, state.x)
@@ -179,12 +177,16 @@ def heat_arguments(step: Step, state: State) -> tuple[Any, ...]:
     options = [TRANSFERS.index(heat.transfer), heat.max_iterations, surface]
     boundaries = [temperatures, of_terms, power] if heat.boundaries.entries else []
     tensors = [temperature, *values[:2], *melting, *gradient]
-    return tensors, options, [heat.tolerance, heat.reference, heat.plastic_heating], numbers, terms, boundaries
+    scalars = [heat.tolerance, heat.reference, heat.plastic_heating, heat.adjoint_tolerance]
+    return tensors, options, scalars, numbers, terms, boundaries
 
 
 def heat_changes(heat: Heat, state: State, packed: Tensor, status: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-    """Temperature after the steps, and the other fields of heat by their keys in `State.extra`; stores the status."""
+    """Temperature after the steps, and the other fields of heat by their keys in `State.extra`; stores the status, and
+    later that of the adjoint solves."""
     heat.count(status)
+    if packed.grad_fn is not None:
+        packed.grad_fn.report = heat.count_adjoint  # type: ignore[attr-defined]
     dim, extra, first = state.x.shape[1], {}, 1
     if heat.affine:
         extra[GRADIENT] = packed[:, first : first + dim]

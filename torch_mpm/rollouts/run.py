@@ -69,10 +69,11 @@ def rollout(
         plan: the plan of `plan_rollout` for these steps, in place of `checkpoint`, `graph` and `schedule`. None: the
             rollout makes it.
 
-    A `Step` of compiled laws without user functions computes all steps in one op, or in a few calls of it. With
-    heat it does so without gradients, if the boundaries of the heat are held obstacles of the step, sources, or
-    terms of the free surface with constant numbers, and on the CPU also if laws expand or melt, or have a `Table`
-    of the temperature among their parameters. `Step.explain` returns the executor, the schedule and the reasons.
+    A `Step` of compiled laws without user functions computes all steps in one op, or in a few calls of it. With heat
+    it does so if the boundaries of the heat are held obstacles of the step, sources, or terms of the free surface with
+    constant numbers; laws may expand or melt, or have a `Table` of the temperature among their parameters. With
+    gradients heat must have no boundaries and no plastic heating, and laws must not read the temperature.
+    `Step.explain` returns the executor, the schedule and the reasons.
     The results are those of single steps. On CUDA they are bitwise equal, with two exceptions, which round
     differently, as all steps on a CPU do:
 
@@ -85,8 +86,9 @@ def rollout(
     The backward pass of the op recomputes the steps from stored states: one every `checkpoint` steps, by default
     sqrt(n) of them, and more where states are small. A stored state of a solid has 2 D + 2 D² numbers per particle (24
     in 3-D, 96 bytes in float32) and its history. While the backward pass processes `checkpoint` steps, it stores about
-    2 D + 4 D² numbers per particle (42 in 3-D) for each of them, and at most half as much for the grid. If all steps
-    fit into `Checkpoints(memory=...)`, they are stored and not recomputed. Second derivatives need single steps.
+    2 D + 4 D² numbers per particle (42 in 3-D) for each of them, those of heat, and at most half as much for the grid.
+    If all steps fit into `Checkpoints(memory=...)`, they are stored and not recomputed. Second derivatives need single
+    steps.
 
     On CUDA and without gradients, other steps without user functions are replays of a CUDA graph of one step.
     `make_graphed_step` serves steps with user functions, and `estimate_rollout` returns the memory and time of a

@@ -1,0 +1,101 @@
+#include "heat/backward.h"
+#include "transfer/gather.cpu.h"
+
+// Adjoint of a step of heat, one pass over the particles for G2P and one for P2G.
+namespace mpm::cpu {
+inline namespace TORCH_MPM_ISA {
+namespace {
+
+// A group as the particles of a body. It stores no lane beyond the group, whose particles others still read.
+template <class T>
+struct AtGroup {
+  using Value = Lanes<T>;
+  const Group& g;
+
+  MPM_HD Value load(const T* pointer, int64_t stride) const { return load_row(pointer, stride, g); }
+  MPM_HD void store(T* pointer, int64_t stride, const Value& value) const {
+    store_row_exactly(value, pointer, stride, g);
+  }
+};
+
+// The bodies are calls, which do not depend on the order of the B-spline.
+template <bool Affine, class T, int D>
+[[gnu::noinline]] void pull_back(const HeatToParticlesBackwardArguments<T, D>& a, const Group& g, int scene,
+                                 const HeatGathered<Lanes<T>, D, 2>& gathered) {
+  const Lanes<T> dt(step_of_scene(a.forward.scene_dt, a.forward.dt, scene));
+  heat_of_particles_backward<Affine>(a, AtGroup<T>{g}, scene, dt, gathered);
+}
+
+template <class T, int D>
+[[gnu::noinline]] void pull_back(const HeatToNodesBackwardArguments<T, D>& a, const Group& g, int scene,
+                                 const HeatGathered<Lanes<T>, D, kHeatChannels>& gathered) {
+  const Lanes<T> dt(step_of_scene(a.forward.scene_dt, a.forward.dt, scene));
+  heat_of_nodes_backward(a, AtGroup<T>{g}, scene, dt, gathered);
+}
+
+// What particles gather, with moments times a scale.
+template <int Order, int Channels, bool Affine, class T, int D>
+MPM_HD HeatGathered<Lanes<T>, D, Channels> gathered(const Lanes<T> f[D], const T* tile, double scale) {
+  Sums<Lanes<T>, D> sums[Channels];
+  gather_channels<Order, Channels, Affine, false, T, D>(f, tile, sums);
+  HeatGathered<Lanes<T>, D, Channels> r;
+  MPM_UNROLL for (int k = 0; k < Channels; k++) {
+    r.value[k] = sums[k].value;
+    MPM_UNROLL for (int d = 0; d < D; d++)
+      r.moment[k][d] = Affine ? Lanes<T>(scale) * sums[k].moment[d] : Lanes<T>(0);
+  }
+  return r;
+}
+
+template <int Order, bool Affine, class T, int D>
+void from_particles(const HeatToParticlesBackwardArguments<T, D>& a) {
+  const HeatToParticlesArguments<T, D>& in = a.forward;
+  const double scale = in.moment_scale * double(in.topology.geometry.dx);
+  gather_groups<Order>(in.topology, in.x, in.nodes, 0, 2,
+                       [&](const Group& g, const Lanes<T> f[D], int scene, const T* tile) {
+                         pull_back<Affine>(a, g, scene, gathered<Order, 2, Affine, T, D>(f, tile, scale));
+                       });
+}
+
+template <int Order, bool Affine, class T, int D>
+void from_nodes(const HeatToNodesBackwardArguments<T, D>& a) {
+  const HeatToNodesArguments<T, D>& in = a.forward;
+  const double dx = double(in.topology.geometry.dx);
+  gather_groups<Order>(in.topology, in.x, a.nodes, 0, kHeatChannels,
+                       [&](const Group& g, const Lanes<T> f[D], int scene, const T* tile) {
+                         pull_back(a, g, scene, gathered<Order, kHeatChannels, Affine, T, D>(f, tile, dx));
+                       });
+}
+
+}  // namespace
+
+template <int Order, class T, int D>
+void heat_to_particles_backward(const HeatToParticlesBackwardArguments<T, D>& a) {
+  a.gradient.pointer ? from_particles<Order, true>(a) : from_particles<Order, false>(a);
+}
+
+template <class T, int D>
+void heat_nodes_backward(const HeatNodesBackwardArguments<T, D>& a) {
+  constexpr int64_t grain = 64;  // slots below which a range is not split
+  const Topology<T, D>& t = a.topology;
+  parallel_ranges(t.max_blocks, grain, [&](int64_t begin, int64_t end) {
+    for (int64_t slot = begin; slot < end; slot++) {
+      const int block = t.block[slot], scene = block / t.geometry.blocks_per_scene;
+      if (block < 0 || scene >= t.scenes) continue;
+      for (int64_t i = slot * kBlockNodes<D>; i < (slot + 1) * kBlockNodes<D>; i++) heat_of_node_backward(a, scene, i);
+    }
+  });
+}
+
+template <int Order, class T, int D>
+void heat_to_nodes_backward(const HeatToNodesBackwardArguments<T, D>& a) {
+  a.gradient.pointer ? from_nodes<Order, true>(a) : from_nodes<Order, false>(a);
+  for_outside(a.forward.topology, [&](int64_t p) { skip_heat_of_nodes_backward(a, p); });
+}
+
+MPM_INSTANTIATE_ORDERS(heat_to_particles_backward, HeatToParticlesBackwardArguments)
+MPM_INSTANTIATE(heat_nodes_backward, HeatNodesBackwardArguments)
+MPM_INSTANTIATE_ORDERS(heat_to_nodes_backward, HeatToNodesBackwardArguments)
+
+}  // namespace TORCH_MPM_ISA
+}  // namespace mpm::cpu

@@ -1,0 +1,284 @@
+#pragma once
+
+#include "heat/local.h"
+#include "pointwise/heat.h"
+
+// Adjoint of a step of heat in a body without boundaries, as torch_mpm/heat/heat.py computes the step. Particles gather
+// the adjoint of G2P, nodes have that of the solve (heat_cg in torch_mpm/ops/heat.py), and particles gather that of
+// P2G. The formulas are those of the step, differentiated by dual numbers (pointwise/heat.h).
+namespace mpm {
+
+// Trilinear forms of particles and nodes whose position gradients belong to the step: those of P2G, in the order of
+// HeatChannel, those of G2P, and the two of λ · H (θ + d).
+enum HeatForm : int { kHeatIncrement = kHeatChannels, kHeatAverage, kHeatAfter, kHeatMultiplier, kHeatForms };
+
+// Columns of the adjoints of the parameters.
+enum HeatParameter : int { kConductivity, kSpecificHeat, kMeltingPoint, kLatentHeat, kHeatParameters };
+
+// Adjoint of G2P: from the adjoints of the temperature, its gradient and the liquid fraction to those of the nodes.
+template <class T, int D>
+struct HeatToParticlesBackwardArguments {
+  HeatToParticlesArguments<T, D> forward;  // its results are unused
+  Field<T> theta, gradient, liquid;        // adjoints after the step, replaced by their parts by the values before it
+  Field<T> value, moment;                  // [P, kHeatForms], [P, kHeatForms, D]: those of G2P, the moments times D⁻¹
+  Field<T> blend;                          // adjoint of β
+  Field<T> velocity_gradient;              // added, as those below
+  Field<T> parameters, dt;                 // [P, kHeatParameters], [P]; may be absent
+};
+
+// Adjoint of the solve and of the averages, with the solution λ of A λ = adjoint of the increment.
+template <class T, int D>
+struct HeatNodesBackwardArguments {
+  Topology<T, D> topology;
+  const T* sums = nullptr;        // after the solve, kHeatChannels
+  const T* theta = nullptr;       // averages before it
+  const T* multiplier = nullptr;  // λ
+  const T* product = nullptr;     // H λ
+  const T* adjoints = nullptr;    // of the increment and θ̄ [N, 2]
+  Field<const T> scene_dt;
+  double dt = 0;
+  T* forms = nullptr;  // [N, kHeatForms]: adjoints of the sums; increment, θ̄, θ + d and λ
+  T* rate = nullptr;   // λ d/dt², whose sum with the heat capacities is the adjoint of dt; may be absent
+};
+
+// Adjoint of P2G and of the weights of the particles.
+template <class T, int D>
+struct HeatToNodesBackwardArguments {
+  HeatToNodesArguments<T, D> forward;
+  Field<const T> rest, F, J;   // of the present volume; the last two may be absent
+  NodeField<const T> nodes;    // adjoints of the sums, kHeatChannels
+  Field<const T> blend;        // adjoint of β by G2P
+  Field<const T> rate;         // gathered λ d/dt², absent where the adjoint of dt is not wanted
+  double inverse_inertia = 1;  // D⁻¹ [1/m²]
+  Field<T> value, moment;      // forms: those of P2G are written, ∇(θ + d) and ∇λ become those of the solve
+  Field<T> theta, gradient;    // adjoints, added, as those below
+  Field<T> velocity_gradient;
+  Field<T> mass, volume, parameters, dt;  // of the rest volume; may be absent
+  Field<T> F_term, J_term;                // written, absent with F and J
+};
+
+inline namespace TORCH_MPM_ISA {
+
+template <class At, class T>
+MPM_HD typename At::Value load_value(const At& at, const HeatValue<T>& v, int scene) {
+  using V = typename At::Value;
+  if (v.per_scene || v.stride == 0) return V(v.pointer[v.per_scene ? scene * v.stride : 0]);
+  return at.load(v.pointer, v.stride);
+}
+
+// Time step of a scene.
+template <class T>
+MPM_HD T step_of_scene(const Field<const T>& scene_dt, double dt, int scene) {
+  return scene_dt.pointer ? T(dt) * scene_dt.pointer[scene * scene_dt.stride[0]] : T(dt);
+}
+
+// Column k of a field [P, K] or [P, K, D].
+template <class T>
+MPM_HD Field<T> entry(const Field<T>& f, int k) {
+  return {f.pointer + k * f.stride[1], {f.stride[0], f.stride[2], 0}};
+}
+
+template <class At, class T>
+MPM_HD void add_scalar(const At& at, const Field<T>& f, const typename At::Value& value) {
+  if (f.pointer) store_scalar(Adding<At>(at), f, value);
+}
+
+// Adds to the adjoint of a parameter, if it is wanted.
+template <class At, class T>
+MPM_HD void add_parameter(const At& at, const Field<T>& f, HeatParameter k, const typename At::Value& value) {
+  if (f.pointer) store_scalar(Adding<At>(at), entry(f, k), value);
+}
+
+// What a particle has gathered: values of channels, and their moments about it.
+template <class V, int D, int Channels>
+struct HeatGathered {
+  V value[Channels];
+  Vector<V, D> moment[Channels];
+};
+
+// Replaces the adjoints of θ and the liquid fraction by those before melting; θ is that after G2P.
+template <class At, class T, int D>
+MPM_HD void pull_back_melting(const HeatToParticlesBackwardArguments<T, D>& a, const At& at, int scene,
+                              const typename At::Value& theta, typename At::Value& grad_theta) {
+  using V = typename At::Value;
+  using Melt = Applied<HeatMelt, D>;
+  const HeatToParticlesArguments<T, D>& f = a.forward;
+  const V in[] = {theta,
+                  load_scalar(at, f.particles.liquid),
+                  load_value(at, f.melting_point, scene),
+                  load_value(at, f.specific_heat, scene),
+                  load_value(at, f.latent_heat, scene),
+                  load_scalar(at, f.number)};
+  const V adjoint[] = {grad_theta, load_scalar(at, constant(a.liquid)), V(0)};
+  V grad[Melt::kIn];
+  Melt::pull_back(in, adjoint, [](int n) { return n < Melt::kIn - 1; }, [&](int n, const V& sum) { grad[n] = sum; });
+  grad_theta = grad[0];
+  store_scalar(at, a.liquid, grad[1]);
+  add_parameter(at, a.parameters, kMeltingPoint, grad[2]);
+  add_parameter(at, a.parameters, kSpecificHeat, grad[3]);
+  add_parameter(at, a.parameters, kLatentHeat, grad[4]);
+}
+
+// At particles inside the grid, from the increment and θ̄; the moments are times D⁻¹. Particles outside keep their
+// temperature, so that its adjoint is unchanged.
+template <bool Affine, class At, class T, int D>
+MPM_HD void heat_of_particles_backward(const HeatToParticlesBackwardArguments<T, D>& a, const At& at, int scene,
+                                       const typename At::Value& dt,
+                                       const HeatGathered<typename At::Value, D, 2>& gathered) {
+  using V = typename At::Value;
+  using Update = Applied<HeatUpdate<2>, D>;
+  const HeatToParticlesArguments<T, D>& f = a.forward;
+  V in[Update::kIn], out[Update::kOut], adjoint[Update::kOut], grad[Update::kIn];
+  Writer<V, D> arguments{in}, adjoints{adjoint};
+  MPM_UNROLL for (const V& value : gathered.value)
+    arguments.put(value);
+  MPM_UNROLL for (const Vector<V, D>& moment : gathered.moment)
+    arguments.put(moment);
+  arguments.put(load_scalar(at, f.particles.theta));
+  arguments.put(Affine ? load_vector<D>(at, f.particles.gradient) : zero_vector<V, D>());
+  arguments.put(load_scalar(at, f.blend));
+  arguments.put(load_matrix<D>(at, f.velocity_gradient));
+  arguments.put(dt);
+  V grad_theta = load_scalar(at, constant(a.theta));
+  if (a.liquid.pointer) {
+    Update::evaluate(in, out);
+    pull_back_melting(a, at, scene, out[0], grad_theta);
+  }
+  adjoints.put(grad_theta);
+  adjoints.put(Affine ? load_vector<D>(at, constant(a.gradient)) : zero_vector<V, D>());
+  Update::pull_back(in, adjoint, [](int) { return true; }, [&](int n, const V& sum) { grad[n] = sum; });
+
+  Reader<V, D> read{grad};
+  MPM_UNROLL for (int k = kHeatIncrement; k <= kHeatAverage; k++)
+    store_scalar(at, entry(a.value, k), read.scalar());
+  MPM_UNROLL for (int k = kHeatIncrement; k <= kHeatAverage; k++) {
+    const Vector<V, D> moment = read.vector();
+    if (Affine) store_vector<D>(at, entry(a.moment, k), V(T(f.moment_scale)) * moment);
+  }
+  store_scalar(at, a.theta, read.scalar());
+  const Vector<V, D> gradient = read.vector();
+  if (Affine) store_vector<D>(at, a.gradient, gradient);
+  store_scalar(at, a.blend, read.scalar());
+  store_matrix<D>(Adding<At>(at), a.velocity_gradient, read.matrix());
+  add_scalar(at, a.dt, read.scalar());
+}
+
+// At a node of a block of a scene.
+template <class T, int D>
+MPM_HD void heat_of_node_backward(const HeatNodesBackwardArguments<T, D>& a, int scene, int64_t i) {
+  using Means = Applied<HeatMeans<2>, D>;
+  const T step = step_of_scene(a.scene_dt, a.dt, scene);
+  const T dt = step > T(0) ? step : T(1);  // no system of a paused scene is solved: d and λ are zero
+  const T* const sum = a.sums + i * kHeatChannels;
+  const T capacity = sum[kHeatCapacity], varying = sum[kHeatVarying], increment = sum[kHeatTheta];
+  const T theta = a.theta[i], average = sum[kHeatMean], multiplier = a.multiplier[i],
+          rate = multiplier * increment / dt;
+  const T in[] = {capacity * theta, varying * average, capacity, varying};
+  const T adjoint[] = {-rate, T(0), -a.product[i], a.adjoints[2 * i + 1]};
+  T grad[Means::kIn];
+  Means::pull_back(in, adjoint, [](int) { return true; }, [&](int n, const T& value) { grad[n] = value; });
+  T* const form = a.forms + i * kHeatForms;
+  form[kHeatTheta] = grad[0];
+  form[kHeatMean] = grad[1];
+  form[kHeatCapacity] = grad[2];
+  form[kHeatVarying] = grad[3];
+  form[kHeatIncrement] = increment;
+  form[kHeatAverage] = average;
+  form[kHeatAfter] = theta + increment;
+  form[kHeatMultiplier] = multiplier;
+  if (a.rate) a.rate[i] = rate / dt;
+}
+
+// Adjoint of κ V by λ · H (θ + d) = Σ_p κ V ∇(θ + d) · ∇λ, which the equation of the solve subtracts; the gradients in
+// the moments become the factors of the forms.
+template <class At, class T, int D>
+MPM_HD typename At::Value pull_back_conduction(const HeatToNodesBackwardArguments<T, D>& a, const At& at,
+                                               const typename At::Value& conductance) {
+  using V = typename At::Value;
+  const Field<T> after = entry(a.moment, kHeatAfter), multiplier = entry(a.moment, kHeatMultiplier);
+  const Vector<V, D> of_after = load_vector<D>(at, constant(after)),
+                     of_multiplier = load_vector<D>(at, constant(multiplier));
+  const V scale = -(V(T(a.inverse_inertia)) * conductance);
+  store_vector<D>(at, after, scale * of_multiplier);
+  store_vector<D>(at, multiplier, scale * of_after);
+  return -dot(of_after, of_multiplier);
+}
+
+// At particles inside the grid, from the adjoints of the sums.
+template <class At, class T, int D>
+MPM_HD void heat_of_nodes_backward(const HeatToNodesBackwardArguments<T, D>& a, const At& at, int scene,
+                                   const typename At::Value& dt,
+                                   const HeatGathered<typename At::Value, D, kHeatChannels>& gathered) {
+  using V = typename At::Value;
+  using Weights = Applied<HeatWeightsOfParticle, D>;
+  using Moments = Applied<HeatMoments<2>, D>;
+  const HeatToNodesArguments<T, D>& f = a.forward;
+  V in[Weights::kIn], weights[Weights::kOut];
+  Writer<V, D> arguments{in};
+  arguments.put(load_scalar(at, a.rest));
+  arguments.put(a.J.pointer ? load_scalar(at, a.J) : V(1));
+  arguments.put(!a.J.pointer && a.F.pointer ? load_matrix<D>(at, a.F) : identity<V, D>());
+  arguments.put(load_value(at, f.specific_heat, scene));
+  arguments.put(load_value(at, f.conductivity, scene));
+  arguments.put(load_scalar(at, f.mass));
+  arguments.put(dt);
+  arguments.put(load_matrix<D>(at, f.velocity_gradient));
+  arguments.put(V(f.topology.geometry.dx));
+  Weights::evaluate(in, weights);
+  const V capacity = weights[1], conductance = weights[2], blend = blend_of(f.transfer, weights[3]);
+
+  V sums[Moments::kIn], of_nodes[Moments::kOut], adjoint[Moments::kOut], grad[Moments::kIn];
+  Writer<V, D> of_sums{sums}, adjoints{adjoint};
+  of_sums.put(load_scalar(at, f.particles.theta));
+  of_sums.put(f.particles.gradient.pointer ? load_vector<D>(at, f.particles.gradient) : zero_vector<V, D>());
+  of_sums.put(capacity);
+  of_sums.put(blend);
+  Moments::evaluate(sums, of_nodes);
+  constexpr int order[] = {kHeatTheta, kHeatMean, kHeatCapacity, kHeatVarying};  // of the results of HeatMoments
+  MPM_UNROLL for (int k = 0; k < kHeatChannels; k++) {
+    store_scalar(at, entry(a.value, order[k]), of_nodes[k]);
+    adjoints.put(gathered.value[order[k]]);
+  }
+  Reader<V, D> of_slopes{of_nodes + kHeatChannels};
+  MPM_UNROLL for (int k = 0; k < kHeatChannels; k++) {
+    const Vector<V, D> moment = of_slopes.vector();  // zero in the capacities, which are not stored
+    const bool stored = f.particles.gradient.pointer && order[k] >= kHeatTheta;
+    if (stored) store_vector<D>(at, entry(a.moment, order[k]), moment);
+    adjoints.put(gathered.moment[order[k]]);
+  }
+  Moments::pull_back(sums, adjoint, [](int) { return true; }, [&](int n, const V& sum) { grad[n] = sum; });
+  Reader<V, D> by_sums{grad};
+  add_scalar(at, a.theta, by_sums.scalar());
+  const Vector<V, D> gradient = by_sums.vector();
+  if (a.gradient.pointer) store_vector<D>(Adding<At>(at), a.gradient, gradient);
+
+  const V by_capacity = by_sums.scalar(), by_blend = by_sums.scalar() + load_scalar(at, a.blend);
+  const V by_conductance = pull_back_conduction(a, at, conductance);
+  if (a.rate.pointer) add_scalar(at, a.dt, capacity * load_scalar(at, a.rate));
+  const V of_weights[] = {V(0), by_capacity, by_conductance, f.transfer == HeatTransfer::hybrid ? by_blend : V(0),
+                          V(0)};
+  V by[Weights::kIn];
+  Weights::pull_back(in, of_weights, [](int n) { return n < Weights::kIn - 1; }, [&](int n, const V& v) { by[n] = v; });
+  Reader<V, D> read{by};
+  add_scalar(at, a.volume, read.scalar());
+  const V J = read.scalar();
+  if (a.J_term.pointer) store_scalar(at, a.J_term, J);
+  const Matrix<V, D> F = read.matrix();
+  if (a.F_term.pointer) store_matrix<D>(at, a.F_term, a.J.pointer ? zero_matrix<V, D>() : F);
+  add_parameter(at, a.parameters, kSpecificHeat, read.scalar());
+  add_parameter(at, a.parameters, kConductivity, read.scalar());
+  add_scalar(at, a.mass, read.scalar());
+  add_scalar(at, a.dt, read.scalar());
+  store_matrix<D>(Adding<At>(at), a.velocity_gradient, read.matrix());
+}
+
+// A particle outside the grid takes no part.
+template <class T, int D>
+MPM_HD void skip_heat_of_nodes_backward(const HeatToNodesBackwardArguments<T, D>& a, int64_t p) {
+  const One<T> at{p};
+  if (a.J_term.pointer) store_scalar(at, a.J_term, T(0));
+  if (a.F_term.pointer) store_matrix<D>(at, a.F_term, zero_matrix<T, D>());
+}
+
+}  // namespace TORCH_MPM_ISA
+}  // namespace mpm
