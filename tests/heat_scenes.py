@@ -4,6 +4,7 @@ import torch
 
 import torch_mpm as mpm
 from benchmarks.catalogue.laws import named
+from torch_mpm import heat_boundaries
 
 DT = 2e-4
 LAWS = ("neo_hookean", "fluid", "von_mises", "sand", "viscoelastic")
@@ -49,3 +50,39 @@ def composed(step, state, n, dt):
     for _ in range(n):
         state = step(state, dt)
     return state
+
+
+def bodies(dim):
+    """Obstacles of each shape with a kernel, near the block."""
+    at, up = (0.45, 0.25, 0.45)[:dim], (0.1, 1.0, 0.2)[:dim]
+    ball = mpm.shapes.Sphere(0.11)
+    return {
+        "plane": mpm.Plane((0.0, 0.27, 0.0)[:dim], up),
+        "sphere": mpm.Sphere(at, 0.12, velocity=(3.0, 1.0, -2.0)[:dim]),
+        "box": mpm.Box(at, (0.3, 0.15, 0.2)[:dim], rotation=0.3 if dim == 2 else (0.1, 0.2, 0.3)),
+        "capsule": mpm.Capsule(at, up, 0.1, angular_velocity=20.0 if dim == 2 else (0.0, 0.0, 20.0)),
+        "revolved": mpm.boundaries.Revolved(at, ((0.0, 0.0), (0.2, 0.0), (0.0, 0.15)), up),
+        "torus": mpm.Obstacle(mpm.shapes.Torus((0.0, 0.12, 0.0)[:dim], 0.07), at),
+        "sampled": mpm.Obstacle(mpm.shapes.Sampled.of(ball, (-0.2,) * dim, (0.2,) * dim, 0.02), at),
+        "path": mpm.Sphere(lambda t: torch.stack([0.45 + 5 * t, *[0.3 + 0 * t] * (dim - 1)], -1), 0.12),
+        "for a time": mpm.Sphere(at, 0.12, start=2.5 * DT, end=6.5 * DT),
+    }
+
+
+def held(step, *terms):
+    """The step with obstacles that hold a temperature."""
+    step.heat.boundaries = [kind(region, temperature) for kind, region, temperature in terms]
+    step.boundaries = list(dict.fromkeys([*step.boundaries.entries, *(region for _, region, _ in terms)]))
+    return step
+
+
+def terms(scenes=1, particles=0):
+    """Terms of boundaries at the free surface and inside, by name."""
+    surface = heat_boundaries.FreeSurface()
+    each = torch.linspace(1, 2, scenes, dtype=torch.float64)
+    return {
+        "flux": [heat_boundaries.Flux(surface, 4e6 * each if scenes > 1 else 4e6)],
+        "convection": [heat_boundaries.Convection(surface, 3e4, 40.0 * each if scenes > 1 else -20.0)],
+        "radiation": [heat_boundaries.Radiation(surface, 0.9, 3000.0)],
+        "source": [heat_boundaries.Source(2e8 * (torch.ones(particles).double() if particles else each[:1]))],
+    }

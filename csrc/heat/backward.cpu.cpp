@@ -67,6 +67,19 @@ void from_nodes(const HeatToNodesBackwardArguments<T, D>& a) {
                        });
 }
 
+// visit(scene, node) for the nodes of the blocks of the scenes.
+template <class T, int D, class F>
+void for_nodes(const Topology<T, D>& t, const F& visit) {
+  constexpr int64_t grain = 64;  // slots below which a range is not split
+  parallel_ranges(t.max_blocks, grain, [&](int64_t begin, int64_t end) {
+    for (int64_t slot = begin; slot < end; slot++) {
+      const int block = t.block[slot], scene = block / t.geometry.blocks_per_scene;
+      if (block < 0 || scene >= t.scenes) continue;
+      for (int64_t i = slot * kBlockNodes<D>; i < (slot + 1) * kBlockNodes<D>; i++) visit(scene, i);
+    }
+  });
+}
+
 }  // namespace
 
 template <int Order, class T, int D>
@@ -75,16 +88,13 @@ void heat_to_particles_backward(const HeatToParticlesBackwardArguments<T, D>& a)
 }
 
 template <class T, int D>
+void heat_term_backward(const HeatTermBackwardArguments<T, D>& a) {
+  for_nodes(a.forward.topology, [&](int scene, int64_t i) { heat_of_term_backward(a, scene, i); });
+}
+
+template <class T, int D>
 void heat_nodes_backward(const HeatNodesBackwardArguments<T, D>& a) {
-  constexpr int64_t grain = 64;  // slots below which a range is not split
-  const Topology<T, D>& t = a.topology;
-  parallel_ranges(t.max_blocks, grain, [&](int64_t begin, int64_t end) {
-    for (int64_t slot = begin; slot < end; slot++) {
-      const int block = t.block[slot], scene = block / t.geometry.blocks_per_scene;
-      if (block < 0 || scene >= t.scenes) continue;
-      for (int64_t i = slot * kBlockNodes<D>; i < (slot + 1) * kBlockNodes<D>; i++) heat_of_node_backward(a, scene, i);
-    }
-  });
+  for_nodes(a.topology, [&](int scene, int64_t i) { heat_of_node_backward(a, scene, i); });
 }
 
 template <int Order, class T, int D>
@@ -94,6 +104,7 @@ void heat_to_nodes_backward(const HeatToNodesBackwardArguments<T, D>& a) {
 }
 
 MPM_INSTANTIATE_ORDERS(heat_to_particles_backward, HeatToParticlesBackwardArguments)
+MPM_INSTANTIATE(heat_term_backward, HeatTermBackwardArguments)
 MPM_INSTANTIATE(heat_nodes_backward, HeatNodesBackwardArguments)
 MPM_INSTANTIATE_ORDERS(heat_to_nodes_backward, HeatToNodesBackwardArguments)
 

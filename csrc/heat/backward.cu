@@ -80,10 +80,26 @@ struct HeatToNodesPullBack : HeatAdjointSums<Order, T, D, kHeatChannels, kHeatTh
   __device__ void skip(int p) const { skip_heat_of_nodes_backward(a, p); }
 };
 
+// Calls work(a, scene, i) at a node of a block of the scenes.
+template <auto work, class T, int D, class Arguments>
+MPM_HD void at_node(const Topology<T, D>& t, const Arguments& a, int64_t i) {
+  const int block = t.block[i / kBlockNodes<D>], scene = block / t.geometry.blocks_per_scene;
+  if (block >= 0 && scene < t.scenes) work(a, scene, i);
+}
+
+template <class T, int D>
+MPM_HD void term_backward(const HeatTermBackwardArguments<T, D>& a, int64_t i) {
+  at_node<heat_of_term_backward<T, D>>(a.forward.topology, a, i);
+}
+
 template <class T, int D>
 MPM_HD void node_backward(const HeatNodesBackwardArguments<T, D>& a, int64_t i) {
-  const int block = a.topology.block[i / kBlockNodes<D>], scene = block / a.topology.geometry.blocks_per_scene;
-  if (block >= 0 && scene < a.topology.scenes) heat_of_node_backward(a, scene, i);
+  at_node<heat_of_node_backward<T, D>>(a.topology, a, i);
+}
+
+template <class T, int D>
+int64_t nodes_of(const Topology<T, D>& t) {
+  return int64_t(t.max_blocks) * kBlockNodes<D>;
 }
 
 }  // namespace
@@ -97,8 +113,13 @@ void heat_to_particles_backward(const HeatToParticlesBackwardArguments<T, D>& a,
 }
 
 template <class T, int D>
+void heat_term_backward(const HeatTermBackwardArguments<T, D>& a, Stream stream) {
+  for_each<term_backward<T, D>>(nodes_of(a.forward.topology), a, stream);
+}
+
+template <class T, int D>
 void heat_nodes_backward(const HeatNodesBackwardArguments<T, D>& a, Stream stream) {
-  for_each<node_backward<T, D>>(int64_t(a.topology.max_blocks) * kBlockNodes<D>, a, stream);
+  for_each<node_backward<T, D>>(nodes_of(a.topology), a, stream);
 }
 
 template <int Order, class T, int D>
@@ -110,6 +131,7 @@ void heat_to_nodes_backward(const HeatToNodesBackwardArguments<T, D>& a, Stream 
 }
 
 MPM_INSTANTIATE_ORDERS(heat_to_particles_backward, HeatToParticlesBackwardArguments)
+MPM_INSTANTIATE(heat_term_backward, HeatTermBackwardArguments)
 MPM_INSTANTIATE(heat_nodes_backward, HeatNodesBackwardArguments)
 MPM_INSTANTIATE_ORDERS(heat_to_nodes_backward, HeatToNodesBackwardArguments)
 

@@ -3,7 +3,7 @@
 #include "heat/local.h"
 #include "pointwise/heat.h"
 
-// Adjoint of a step of heat in a body without boundaries, as torch_mpm/heat/heat.py computes the step. Particles gather
+// Adjoint of a step of heat without held surfaces, as torch_mpm/heat/heat.py computes the step. Particles gather
 // the adjoint of G2P, nodes have that of the solve (heat_cg in torch_mpm/ops/heat.py), and particles gather that of
 // P2G. The formulas are those of the step, differentiated by dual numbers (pointwise/heat.h).
 namespace mpm {
@@ -26,6 +26,16 @@ struct HeatToParticlesBackwardArguments {
   Field<T> parameters, dt;                 // [P, kHeatParameters], [P]; may be absent
 };
 
+// Adjoint of a term of the boundary by the sums of its free surface and by the node temperatures.
+template <class T, int D>
+struct HeatTermBackwardArguments {
+  HeatTermArguments<T, D> forward;  // its results are unused
+  const T* sums = nullptr;          // of the step after the solve, kHeatChannels
+  const T* multiplier = nullptr;    // λ, see HeatNodesBackwardArguments
+  T* surface = nullptr;             // [N, kHeatChannels], added
+  T* theta = nullptr;               // [N], added
+};
+
 // Adjoint of the solve and of the averages, with the solution λ of A λ = adjoint of the increment.
 template <class T, int D>
 struct HeatNodesBackwardArguments {
@@ -35,6 +45,9 @@ struct HeatNodesBackwardArguments {
   const T* multiplier = nullptr;  // λ
   const T* product = nullptr;     // H λ
   const T* adjoints = nullptr;    // of the increment and θ̄ [N, 2]
+  const T* exchange = nullptr;    // [N], as those below; absent without boundaries
+  const T* by_terms = nullptr;    // adjoint of θ by the terms of the boundary
+  const bool* fixed = nullptr;
   Field<const T> scene_dt;
   double dt = 0;
   T* forms = nullptr;  // [N, kHeatForms]: adjoints of the sums; increment, θ̄, θ + d and λ
@@ -45,13 +58,16 @@ struct HeatNodesBackwardArguments {
 template <class T, int D>
 struct HeatToNodesBackwardArguments {
   HeatToNodesArguments<T, D> forward;
-  Field<const T> rest, F, J;   // of the present volume; the last two may be absent
-  NodeField<const T> nodes;    // adjoints of the sums, kHeatChannels
-  Field<const T> blend;        // adjoint of β by G2P
-  Field<const T> rate;         // gathered λ d/dt², absent where the adjoint of dt is not wanted
-  double inverse_inertia = 1;  // D⁻¹ [1/m²]
-  Field<T> value, moment;      // forms: those of P2G are written, ∇(θ + d) and ∇λ become those of the solve
-  Field<T> theta, gradient;    // adjoints, added, as those below
+  Field<const T> rest, F, J;                 // of the present volume; the last two may be absent
+  NodeField<const T> nodes;                  // adjoints of the sums, kHeatChannels
+  Field<const T> blend;                      // adjoint of β by G2P
+  Field<const T> rate;                       // gathered λ d/dt², absent where the adjoint of dt is not wanted
+  HeatSurfaceArguments<T, D> surface;        // of the boundary, absent without `surface_value`; its sums are unused
+  Field<T> surface_value, surface_gradient;  // [P, 1 + D], [P, 1 + D, D]: gathered adjoints of its sums, then forms
+  Field<T> dissipated;                       // adjoint of the energy that laws dissipate, written; may be absent
+  double inverse_inertia = 1;                // D⁻¹ [1/m²]
+  Field<T> value, moment;    // forms: those of P2G are written, ∇(θ + d) and ∇λ become those of the solve
+  Field<T> theta, gradient;  // adjoints, added, as those below
   Field<T> velocity_gradient;
   Field<T> mass, volume, parameters, dt;  // of the rest volume; may be absent
   Field<T> F_term, J_term;                // written, absent with F and J
@@ -163,6 +179,35 @@ MPM_HD void heat_of_particles_backward(const HeatToParticlesBackwardArguments<T,
   add_scalar(at, a.dt, read.scalar());
 }
 
+// At a node of a block of a scene: the solve adds λ · (source − exchange (θ + d)) to the adjoints.
+template <class T, int D>
+MPM_HD void heat_of_term_backward(const HeatTermBackwardArguments<T, D>& a, int scene, int64_t i) {
+  const HeatTermArguments<T, D>& f = a.forward;
+  const T multiplier = a.multiplier[i];
+  if (f.term == HeatTerm::power) {
+    a.surface[i * kHeatChannels] += multiplier;
+    return;
+  }
+  const T after = f.theta[i] + a.sums[i * kHeatChannels + kHeatTheta];
+  const T* const number = f.number + 2 * int64_t(scene);
+  const auto lifted = [](const T& value) { return Dual<T>{value, T(0)}; };
+  const Vector<T, D> at_node = normal_of_node(f, i);
+  Vector<Dual<T>, D> normal;
+  MPM_UNROLL for (int d = 0; d < D; d++)
+    normal[d] = lifted(at_node[d]);
+  Dual<T> theta = lifted(f.theta[i]);
+  const auto by = [&](Dual<T>& input) {
+    input.derivative = T(1);
+    const HeatRadiationAt<Dual<T>> linear =
+        heat_of_term(f.term, normal, theta, lifted(number[0]), lifted(number[1]), lifted(T(f.reference)));
+    input.derivative = T(0);
+    return multiplier * (linear.power.derivative - after * linear.coefficient.derivative);
+  };
+  MPM_UNROLL for (int d = 0; d < D; d++)
+    a.surface[i * kHeatChannels + 1 + d] += by(normal[d]);
+  a.theta[i] += by(theta);
+}
+
 // At a node of a block of a scene.
 template <class T, int D>
 MPM_HD void heat_of_node_backward(const HeatNodesBackwardArguments<T, D>& a, int scene, int64_t i) {
@@ -174,7 +219,11 @@ MPM_HD void heat_of_node_backward(const HeatNodesBackwardArguments<T, D>& a, int
   const T theta = a.theta[i], average = sum[kHeatMean], multiplier = a.multiplier[i],
           rate = multiplier * increment / dt;
   const T in[] = {capacity * theta, varying * average, capacity, varying};
-  const T adjoint[] = {-rate, T(0), -a.product[i], a.adjoints[2 * i + 1]};
+  T by_theta = -a.product[i];
+  if (a.exchange) by_theta -= a.exchange[i] * multiplier;
+  if (a.by_terms) by_theta += a.by_terms[i];
+  if (a.fixed && a.fixed[i]) by_theta = -a.adjoints[2 * i];  // the increment leads to the held temperature
+  const T adjoint[] = {-rate, T(0), by_theta, a.adjoints[2 * i + 1]};
   T grad[Means::kIn];
   Means::pull_back(in, adjoint, [](int) { return true; }, [&](int n, const T& value) { grad[n] = value; });
   T* const form = a.forms + i * kHeatForms;
@@ -202,6 +251,58 @@ MPM_HD typename At::Value pull_back_conduction(const HeatToNodesBackwardArgument
   store_vector<D>(at, after, scale * of_multiplier);
   store_vector<D>(at, multiplier, scale * of_after);
   return -dot(of_after, of_multiplier);
+}
+
+// Power of a particle by the energy that its law dissipates.
+struct HeatOfDissipation {
+  static constexpr const char* name = "heat_of_dissipation";
+  static constexpr Entries arguments[] = {kScalar, kScalar, kScalar};
+  static constexpr Entries results[] = {kScalar};
+
+  template <class T, int D>
+  MPM_HD static void evaluate(Reader<T, D>& in, Writer<T, D>& out) {
+    const T energy = in.scalar(), rest = in.scalar();
+    out.put(dissipated_power(energy, rest, in.scalar()));
+  }
+};
+
+// Adjoint of the present volume by the free surface and by heat from inside the matter; the gathered adjoints become
+// the factors of the forms of the sums.
+template <class At, class T, int D>
+MPM_HD typename At::Value pull_back_surface(const HeatToNodesBackwardArguments<T, D>& a, const At& at, int scene,
+                                            const typename At::Value& volume, const typename At::Value& dt) {
+  using V = typename At::Value;
+  using Dissipation = Applied<HeatOfDissipation, D>;
+  const HeatSurfaceArguments<T, D>& f = a.surface;
+  const V by_power = load_scalar(at, entry(constant(a.surface_value), 0));
+  V by_volume(0), power(0);
+  MPM_UNROLL for (int k = 0; k <= D; k++) {
+    Vector<V, D> factor = load_vector<D>(at, entry(constant(a.surface_gradient), k));
+    MPM_UNROLL for (int d = 0; d < D; d++) {
+      if (1 + d == k) by_volume = by_volume + factor[d];
+      factor[d] = 1 + d == k ? volume : V(0);
+    }
+    store_vector<D>(at, entry(a.surface_gradient, k), factor);
+  }
+  if (f.power.pointer) {
+    const V density = load_value(at, f.power, scene);
+    by_volume = by_volume + density * by_power;
+    power = density * volume;
+  }
+  if (f.dissipated.pointer) {
+    const V in[] = {V(T(f.share)) * load_scalar(at, f.dissipated), load_scalar(at, f.rest), dt}, adjoint[] = {by_power};
+    V out[1], grad[3];
+    Dissipation::evaluate(in, out);
+    power = power + out[0];
+    Dissipation::pull_back(in, adjoint, [](int) { return true; }, [&](int n, const V& sum) { grad[n] = sum; });
+    store_scalar(at, a.dissipated, V(T(f.share)) * grad[0]);
+    add_scalar(at, a.volume, grad[1]);
+    add_scalar(at, a.dt, grad[2]);
+  }
+  store_scalar(at, entry(a.surface_value, 0), power);
+  MPM_UNROLL for (int k = 1; k <= D; k++)
+    store_scalar(at, entry(a.surface_value, k), V(0));
+  return by_volume;
 }
 
 // At particles inside the grid, from the adjoints of the sums.
@@ -254,8 +355,9 @@ MPM_HD void heat_of_nodes_backward(const HeatToNodesBackwardArguments<T, D>& a, 
 
   const V by_capacity = by_sums.scalar(), by_blend = by_sums.scalar() + load_scalar(at, a.blend);
   const V by_conductance = pull_back_conduction(a, at, conductance);
+  const V by_volume = a.surface_value.pointer ? pull_back_surface(a, at, scene, weights[0], dt) : V(0);
   if (a.rate.pointer) add_scalar(at, a.dt, capacity * load_scalar(at, a.rate));
-  const V of_weights[] = {V(0), by_capacity, by_conductance, f.transfer == HeatTransfer::hybrid ? by_blend : V(0),
+  const V of_weights[] = {by_volume, by_capacity, by_conductance, f.transfer == HeatTransfer::hybrid ? by_blend : V(0),
                           V(0)};
   V by[Weights::kIn];
   Weights::pull_back(in, of_weights, [](int n) { return n < Weights::kIn - 1; }, [&](int n, const V& v) { by[n] = v; });
@@ -276,6 +378,7 @@ MPM_HD void heat_of_nodes_backward(const HeatToNodesBackwardArguments<T, D>& a, 
 template <class T, int D>
 MPM_HD void skip_heat_of_nodes_backward(const HeatToNodesBackwardArguments<T, D>& a, int64_t p) {
   const One<T> at{p};
+  if (a.dissipated.pointer) store_scalar(at, a.dissipated, T(0));
   if (a.J_term.pointer) store_scalar(at, a.J_term, T(0));
   if (a.F_term.pointer) store_matrix<D>(at, a.F_term, zero_matrix<T, D>());
 }

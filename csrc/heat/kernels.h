@@ -32,6 +32,7 @@ MPM_BACKEND_KERNELS(MPM_HEAT_TRANSFER_KERNELS)
 
 #define MPM_HEAT_BACKWARD_KERNELS(PLAIN, ORDERED, SIZE)                 \
   ORDERED(heat_to_particles_backward, HeatToParticlesBackwardArguments) \
+  PLAIN(heat_term_backward, HeatTermBackwardArguments)                  \
   PLAIN(heat_nodes_backward, HeatNodesBackwardArguments)                \
   ORDERED(heat_to_nodes_backward, HeatToNodesBackwardArguments)
 MPM_BACKEND_KERNELS(MPM_HEAT_BACKWARD_KERNELS)

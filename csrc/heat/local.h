@@ -111,21 +111,34 @@ MPM_HD void heat_of_surface(const HeatFromSurfaceArguments<T, D>& a, int scene, 
   a.source[i] = a.exchange[i] * a.temperature[scene * a.stride];
 }
 
+// Heat into a node by a term of the free surface, linear in its temperature θ: power − coefficient θ. The sum Σ V ∇N of
+// the node is a normal with the length of its area.
+template <class T, int D>
+MPM_HD HeatRadiationAt<T> heat_of_term(HeatTerm term, const Vector<T, D>& normal, const T& theta, const T& first,
+                                       const T& second, const T& reference) {
+  const T amount = safe_root(dot(normal, normal)) * first;
+  if (term == HeatTerm::convection) return {amount, amount * second};
+  if (term == HeatTerm::radiation) return heat_radiation(amount, theta, second, reference);
+  return {T(0), amount};  // a flux
+}
+
+template <class T, int D>
+MPM_HD Vector<T, D> normal_of_node(const HeatTermArguments<T, D>& a, int64_t i) {
+  Vector<T, D> normal;
+  MPM_UNROLL for (int d = 0; d < D; d++)
+    normal[d] = a.sums[i * kHeatChannels + 1 + d];
+  return normal;
+}
+
 template <class T, int D>
 MPM_HD void heat_term(const HeatTermArguments<T, D>& a, int scene, int64_t i) {
-  const T* const sum = a.sums + i * kHeatChannels;
   if (a.term == HeatTerm::power) {
-    a.source[i] += sum[0];
+    a.source[i] += a.sums[i * kHeatChannels];
     return;
   }
-  T squared = T(0);
-  MPM_UNROLL for (int d = 0; d < D; d++)
-    squared += sum[1 + d] * sum[1 + d];
   const T* const number = a.number + 2 * int64_t(scene);
-  const T amount = safe_root(squared) * number[0];
-  HeatRadiationAt<T> linear{T(0), amount};  // a flux
-  if (a.term == HeatTerm::convection) linear = {amount, amount * number[1]};
-  if (a.term == HeatTerm::radiation) linear = heat_radiation(amount, a.theta[i], number[1], T(a.reference));
+  const HeatRadiationAt<T> linear =
+      heat_of_term(a.term, normal_of_node(a, i), a.theta[i], number[0], number[1], T(a.reference));
   a.exchange[i] += linear.coefficient;
   a.source[i] += linear.power;
 }

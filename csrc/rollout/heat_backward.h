@@ -19,6 +19,7 @@ template <class T, int D>
 class HeatBackward {
  public:
   Tensor x_term, F_term, J_term;  // adjoints of the particles before the step, from its heat
+  Tensor dissipated;              // adjoint of the energy that its laws dissipate, undefined where none becomes heat
 
   HeatBackward(Recorded<T, D>& record, const SubstepsInputs& in, backend::Stream stream);
 
@@ -30,6 +31,7 @@ class HeatBackward {
     backend::heat_to_particles_backward(order(), up, stream_);
     scatter(up);
     solve(solution.system, adjoints.status);
+    if (heat().has_terms()) adjoint_of_terms(solution);
     adjoint_of_nodes(solution, adjoints.dt.defined());
     gather(solution.down, adjoints.dt.defined());
     backend::heat_to_nodes_backward(order(), to_nodes(i, solution.down, adjoints), stream_);
@@ -51,6 +53,7 @@ class HeatBackward {
   HeatToParticlesBackwardArguments<T, D> to_particles(const HeatSolution<T, D>& solution, const HeatAdjoints& adjoints);
   void scatter(const HeatToParticlesBackwardArguments<T, D>& up);
   void solve(HeatArguments<T, D> system, const Tensor& status);
+  void adjoint_of_terms(const HeatSolution<T, D>& solution);
   void adjoint_of_nodes(const HeatSolution<T, D>& solution, bool by_dt);
   void gather(const HeatToNodesArguments<T, D>& down, bool by_dt);
   HeatToNodesBackwardArguments<T, D> to_nodes(int64_t i, const HeatToNodesArguments<T, D>& down,
@@ -63,6 +66,8 @@ class HeatBackward {
   Tensor value_, moment_, blend_, rate_of_particles_;  // [P, kHeatForms], [P, kHeatForms, D], [P], [P, 1]
   int64_t nodes_ = -1;
   Tensor adjoints_, source_, multiplier_, product_, forms_, rate_;  // of the nodes
+  Tensor surface_, by_terms_;                // adjoints of the sums of the free surface, and of θ by the terms
+  Tensor surface_value_, surface_gradient_;  // [P, 1 + D], [P, 1 + D, D]
   Tensor iterations_, residual_, converged_, workspace_, operator_workspace_;
 };
 
@@ -79,6 +84,9 @@ HeatBackward<T, D>::HeatBackward(Recorded<T, D>& record, const SubstepsInputs& i
   torch::stable::zero_(value_);  // some forms have no values, and some no moments
   torch::stable::zero_(moment_);
   blend_ = empty(x, {P});
+  dissipated = result(x, heat().heats_by_laws(), {P});
+  surface_value_ = result(x, heat().has_terms(), {P, 1 + D});
+  surface_gradient_ = result(x, heat().has_terms(), {P, 1 + D, D});
   iterations_ = empty_int(x, {in.scenes});
   residual_ = empty(x, {in.scenes});
   converged_ = empty(x, {in.scenes}, ScalarType::Bool);
@@ -92,6 +100,7 @@ void HeatBackward<T, D>::make_nodes(const HeatSolution<T, D>& solution) {
   for (Tensor* t : {&source_, &multiplier_, &product_, &rate_}) *t = empty(in_.x, {nodes});
   adjoints_ = empty(in_.x, {nodes, 2});
   forms_ = empty(in_.x, {nodes, kHeatForms});
+  if (heat().has_terms()) surface_ = empty(in_.x, {nodes, kHeatChannels}), by_terms_ = empty(in_.x, {nodes});
   workspace_ = operator_workspace_ = Tensor();
 }
 
@@ -161,6 +170,21 @@ void HeatBackward<T, D>::solve(HeatArguments<T, D> system, const Tensor& status)
 }
 
 template <class T, int D>
+void HeatBackward<T, D>::adjoint_of_terms(const HeatSolution<T, D>& solution) {
+  backend::clear(surface_, stream_);
+  backend::clear(by_terms_, stream_);
+  HeatTermBackwardArguments<T, D> a;
+  a.sums = solution.down.sums.pointer;
+  a.multiplier = rows(multiplier_);
+  a.surface = rows(surface_);
+  a.theta = rows(by_terms_);
+  for (const HeatTermArguments<T, D>& term : heat().terms()) {
+    a.forward = term;
+    backend::heat_term_backward(a, stream_);
+  }
+}
+
+template <class T, int D>
 void HeatBackward<T, D>::adjoint_of_nodes(const HeatSolution<T, D>& solution, bool by_dt) {
   HeatNodesBackwardArguments<T, D> a;
   a.topology = solution.system.topology;
@@ -169,6 +193,9 @@ void HeatBackward<T, D>::adjoint_of_nodes(const HeatSolution<T, D>& solution, bo
   a.multiplier = rows(multiplier_);
   a.product = rows(product_);
   a.adjoints = rows(adjoints_);
+  a.exchange = solution.system.exchange;
+  if (heat().has_terms()) a.by_terms = rows(by_terms_);
+  a.fixed = solution.system.fixed;
   a.scene_dt = solution.down.scene_dt;
   a.dt = solution.down.dt;
   a.forms = rows(forms_);
@@ -176,7 +203,8 @@ void HeatBackward<T, D>::adjoint_of_nodes(const HeatSolution<T, D>& solution, bo
   backend::heat_nodes_backward(a, stream_);
 }
 
-// ∇(θ + d) and ∇λ at the particles, and the mean of λ d/dt² for the adjoint of dt.
+// ∇(θ + d) and ∇λ at the particles, the adjoints of their shares of the free surface, and the mean of λ d/dt² for the
+// adjoint of dt.
 template <class T, int D>
 void HeatBackward<T, D>::gather(const HeatToNodesArguments<T, D>& down, bool by_dt) {
   GatherArguments<T, D> a;
@@ -186,10 +214,17 @@ void HeatBackward<T, D>::gather(const HeatToNodesArguments<T, D>& down, bool by_
   a.moment_scale = in_.lattice.inverse_inertia();
   a.moment = forms(moment_, kHeatAfter);
   backend::gather(order(), a, stream_);
+  a.moment = {};
+  if (heat().has_terms()) {
+    a.nodes = {rows(surface_), kHeatChannels, 1 + D};
+    a.value = field<T>(surface_value_);
+    a.gradient = field<T>(surface_gradient_);
+    backend::gather(order(), a, stream_);
+    a.gradient = {};
+  }
   if (!by_dt) return;
   if (!rate_of_particles_.defined()) rate_of_particles_ = empty_particles(in_.x, {in_.x.size(0), 1});
   a.nodes = {rows(rate_), 1, 1};
-  a.moment = {};
   a.value = field<T>(rate_of_particles_);
   backend::gather(order(), a, stream_);
 }
@@ -207,6 +242,10 @@ HeatToNodesBackwardArguments<T, D> HeatBackward<T, D>::to_nodes(int64_t i, const
   a.blend = field<const T>(blend_);
   if (adjoints.dt.defined()) a.rate = constant(HeatSteps<T, D>::column_of(rate_of_particles_, 0));
   a.inverse_inertia = in_.lattice.inverse_inertia();
+  if (heat().has_terms()) a.surface = heat().surface(before.x, a.rest);
+  a.surface_value = field<T>(surface_value_);
+  a.surface_gradient = field<T>(surface_gradient_);
+  a.dissipated = field<T>(dissipated);
   a.value = field<T>(value_);
   a.moment = field<T>(moment_);
   a.theta = HeatSteps<T, D>::column_of(adjoints.state, 0);
@@ -221,7 +260,7 @@ HeatToNodesBackwardArguments<T, D> HeatBackward<T, D>::to_nodes(int64_t i, const
   return a;
 }
 
-// Of all forms at once.
+// Of all forms: those of the step at once, and those of the free surface.
 template <class T, int D>
 void HeatBackward<T, D>::position_gradient(const HeatToNodesArguments<T, D>& down) {
   PositionGradientArguments<T, D> a;
@@ -231,6 +270,13 @@ void HeatBackward<T, D>::position_gradient(const HeatToNodesArguments<T, D>& dow
   a.moment = field<const T>(moment_);
   a.nodes = {rows(forms_), kHeatForms, kHeatForms};
   a.position_gradient = field<T>(x_term);
+  backend::position_gradient(order(), a, stream_);
+  if (!heat().has_terms()) return;
+  a.value = field<const T>(surface_value_);
+  a.moment = {};
+  a.gradient = field<const T>(surface_gradient_);
+  a.nodes = {rows(surface_), kHeatChannels, 1 + D};
+  a.adds = true;
   backend::position_gradient(order(), a, stream_);
 }
 

@@ -88,13 +88,22 @@ class HeatSteps {
   // The columns of a tensor in the order of the fields.
   static Field<T> column_of(const Tensor& t, int first) { return column(field<T>(t), first); }
   int gradient_column() const { return gradient_; }
+  // The energy that laws have dissipated in a step, before its `run` [P, 1].
+  Tensor dissipated_energy() const {
+    Tensor all = fields.tensor();
+    return torch::stable::narrow(all, 1, dissipated_, 1);
+  }
+
+  // The terms of the free surface, and heat from inside the matter; and what they read of the particles.
+  bool has_terms() const { return !in_.heat_terms.empty() || has_power() || heats_by_laws(); }
+  std::vector<HeatTermArguments<T, D>> terms() const;
+  HeatSurfaceArguments<T, D> surface(const Field<const T>& x, const Field<const T>& rest) const;
 
  private:
   int64_t particles() const { return in_.x.size(0); }
   int64_t held_nodes() const { return int64_t(in_.held_obstacles.size()) - holds_surface(); }
   // The last of the held obstacles is held at its surface, the others at the nodes in them.
   bool holds_surface() const { return in_.heat_options[2] != 0; }
-  bool has_terms() const { return !in_.heat_terms.empty() || has_power() || heats_by_laws(); }
   // Tensors of the boundaries: held temperatures, numbers of the terms, power of the source; absent ones are empty.
   enum Boundaries : size_t { kHeld, kNumbers, kPower, kBoundaries };
   bool given(Boundaries k) const { return !in_.heat_boundaries.empty() && in_.heat_boundaries[k].numel() > 0; }
@@ -145,14 +154,12 @@ class HeatSteps {
   Tensor sums_, theta_, capacity_, increment_, iterations_, residual_, converged_, workspace_;
 };
 
-// The adjoint has no boundaries of heat, no heating by laws, and no laws that read temperatures
-// (torch_mpm/rollouts/fused_heat.py).
+// The adjoint has no held surfaces, and no laws that read temperatures (torch_mpm/rollouts/fused_heat.py).
 inline void check_heat_has_gradients(const SubstepsInputs& in) {
-  const bool heats_by_laws = in.heat_scalars.size() > 2 && in.heat_scalars[2] > 0;
-  STD_TORCH_CHECK(
-      in.heat_boundaries.empty() && in.thermal.empty() && !heats_by_laws && in.laws.find('~') == std::string::npos,
-      "heat with boundaries, plastic heating or laws that read the temperature is computed without "
-      "gradients: records must be false, and resident true");
+  const bool holds_surface = in.heat_options.size() > 2 && in.heat_options[2] != 0;
+  STD_TORCH_CHECK(!holds_surface && in.thermal.empty() && in.laws.find('~') == std::string::npos,
+                  "heat with a held surface or with laws that read the temperature is computed without gradients: "
+                  "records must be false, and resident true");
 }
 
 template <class T, int D>
@@ -391,29 +398,31 @@ void HeatSteps<T, D>::check_terms() {
   STD_TORCH_CHECK(in_.heat_boundaries[kNumbers].is_contiguous(), "the numbers of heat_terms must be contiguous");
 }
 
-// The terms of the free surface, and the heat from inside the matter.
 template <class T, int D>
-void HeatSteps<T, D>::add_terms(const Field<const T>& x, const Field<const T>& rest, backend::Stream stream) {
-  backend::clear(surface_, stream);
-  T* const sums = static_cast<T*>(surface_.data_ptr());
-  HeatSurfaceArguments<T, D> down;
-  down.topology = s_.p2g.topology;
-  down.x = x;
-  down.volume = columns().volume;
-  if (has_power()) down.power = value(power_);
+HeatSurfaceArguments<T, D> HeatSteps<T, D>::surface(const Field<const T>& x, const Field<const T>& rest) const {
+  HeatSurfaceArguments<T, D> a;
+  a.topology = s_.p2g.topology;
+  a.x = x;
+  a.volume = columns().volume;
+  if (has_power()) a.power = value(power_);
   if (heats_by_laws()) {
-    down.dissipated = column(fields.now(), dissipated_);
-    down.rest = rest;
-    down.share = in_.heat_scalars[2];
-    down.scene_dt = s_.p2g.scene_dt;
-    down.dt = in_.dt;
+    a.dissipated = column(fields.now(), dissipated_);
+    a.rest = rest;
+    a.share = in_.heat_scalars[2];
+    a.scene_dt = s_.p2g.scene_dt;
+    a.dt = in_.dt;
   }
-  down.deterministic = in_.lattice.deterministic();
-  down.sums = {sums, kHeatChannels, kHeatChannels};
-  backend::heat_surface(in_.lattice.order(), down, stream);
+  a.deterministic = in_.lattice.deterministic();
+  a.sums = {static_cast<T*>(surface_.data_ptr()), kHeatChannels, kHeatChannels};
+  return a;
+}
+
+template <class T, int D>
+std::vector<HeatTermArguments<T, D>> HeatSteps<T, D>::terms() const {
+  std::vector<HeatTermArguments<T, D>> list;
   HeatTermArguments<T, D> a;
   a.topology = s_.p2g.topology;
-  a.sums = sums;
+  a.sums = static_cast<const T*>(surface_.data_ptr());
   a.theta = field<const T>(theta_).pointer;
   a.reference = in_.heat_scalars[1];
   a.exchange = static_cast<T*>(exchange_.data_ptr());
@@ -421,10 +430,18 @@ void HeatSteps<T, D>::add_terms(const Field<const T>& x, const Field<const T>& r
   for (size_t k = 0; k < in_.heat_terms.size(); k++) {
     a.term = HeatTerm(in_.heat_terms[k]);
     a.number = static_cast<const T*>(in_.heat_boundaries[kNumbers].data_ptr()) + 2 * int64_t(k) * in_.scenes;
-    backend::heat_add_term(a, stream);
+    list.push_back(a);
   }
   a.term = HeatTerm::power;
-  if (has_power() || heats_by_laws()) backend::heat_add_term(a, stream);
+  if (has_power() || heats_by_laws()) list.push_back(a);
+  return list;
+}
+
+template <class T, int D>
+void HeatSteps<T, D>::add_terms(const Field<const T>& x, const Field<const T>& rest, backend::Stream stream) {
+  backend::clear(surface_, stream);
+  backend::heat_surface(in_.lattice.order(), surface(x, rest), stream);
+  for (const HeatTermArguments<T, D>& term : terms()) backend::heat_add_term(term, stream);
 }
 
 template <class T, int D>

@@ -89,6 +89,7 @@ class Recorded {
   Record<T> x, v, C, F, J, residual, history, stress;
   Record<T> mapped;      // F after the return maps
   Record<T> heat_after;  // temperature, gradient and liquid fraction
+  Record<T> dissipated;  // energy that laws have turned into heat
 
   // In `memory`, filled by an earlier `run`, or in new memory.
   Recorded(const SubstepsInputs& in, const OptionalTensor& memory, backend::Stream stream);
@@ -105,6 +106,10 @@ class Recorded {
     Tensor before = heat->state();
     torch::stable::copy_(before, i == 0 ? first_heat_ : heat_after.vector(i - 1));
     heat->begin(state(i).F, state(i).J, steps.p2g.volume, stream_);
+    if (heat->heats_by_laws()) {
+      Tensor energy = heat->dissipated_energy();
+      torch::stable::copy_(energy, dissipated.vector(i));
+    }
     return heat->conduct(state(i).x, steps.p2g.mass, steps.p2g.volume, constant(C[i]), scene_of_particles(), stream_);
   }
 
@@ -172,7 +177,16 @@ class Recorded {
 
   Field<const int> scene_of_particles() const { return {steps.activation.scene, {steps.activation.scene_stride}}; }
 
+  void begin_heat(int64_t i) {
+    heat->begin(state(i).F, state(i).J, steps.p2g.volume, stream_);
+    if (heat->heats_by_laws()) steps.dissipate(heat->dissipated());
+  }
+
   void conduct_heat(int64_t i) {
+    if (heat->heats_by_laws()) {
+      Tensor energy = dissipated.vector(i);
+      torch::stable::copy_(energy, heat->dissipated_energy());
+    }
     heat->run(state(i).x, steps.p2g.mass, steps.p2g.volume, constant(C[i]), scene_of_particles(), stream_);
     Tensor to = heat_after.vector(i);
     torch::stable::copy_(to, heat->state());
@@ -233,6 +247,7 @@ Recorded<T, D>::Recorded(const SubstepsInputs& in, const OptionalTensor& memory,
   if (HeatSteps<T, D>::wanted(in)) {
     heat.emplace(steps);
     first_heat_ = copy_of(heat->state());
+    steps.laws_are_apart = heat->heats_by_laws();
   }
   steps.forget_stress();  // each step has its own stress
   steps.fuse(true);
@@ -283,6 +298,7 @@ void Recorded<T, D>::lay_out(Arena& arena) {
   stress = Record<T>(arena, given, n, D, D);
   if (steps.plastic) mapped = Record<T>(arena, given, n, D, D);
   if (heat) heat_after = Record<T>(arena, given, n, heat->state_columns());
+  if (heat && heat->heats_by_laws()) dissipated = Record<T>(arena, given, n);
   status_ = arena.take<int>((1 + n) * (1 + in_.scenes) * kStatusSize);
   if (!keeps_grids_) return;
   const Shape nodes = Pool<T, D>::nodes_shape(steps.activation);
@@ -316,7 +332,7 @@ bool Recorded<T, D>::run() {
     if (!memory().defined()) keeps_grids_ = steps.nodes_are_clear = false;  // all steps share the grown pool
     steps.write({x[i], v[i], C[i], F[i], J[i], residual[i], history[i]});
     if (has(in_.material)) keep_others(i);
-    if (heat) heat->begin(state(i).F, state(i).J, steps.p2g.volume, stream_);
+    if (heat) begin_heat(i);
     steps.run_laws(stream_);
     steps.move(stream_);
     if (heat) conduct_heat(i);

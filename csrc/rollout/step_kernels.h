@@ -243,8 +243,9 @@ struct Substeps {
   // Sets where laws store the energy that they dissipate, [P].
   void dissipate(const Field<T>& to) {
     for (size_t k = 0; k < laws.size(); k++)
-      if (calls[k].law->info.plastic || !calls[k].history.empty()) laws[k].dissipated = to;
+      if (dissipates(k)) laws[k].dissipated = to;
   }
+  bool dissipates(size_t k) const { return calls[k].law->info.plastic || !calls[k].history.empty(); }
 
   // Computes the stress, if P2G does not.
   void run_laws(backend::Stream stream) {

@@ -66,7 +66,7 @@ class SubstepsBackward {
       backward_advance(i, adjoints);
       backward_grid(i, adjoints, sums);
       if (s_.flips()) backward_kept(adjoints);
-      backward_laws(adjoints);
+      backward_laws(adjoints, heat ? heat->dissipated : absent());
       if (heat) add_terms({{adjoints.x, heat->x_term}, {adjoints.F, heat->F_term}, {adjoints.J, heat->J_term}});
       if (adjoints.dt.defined()) add_terms({{adjoints.dt, motion_dt_}, {adjoints.dt, stress_dt_}});
       after_substeps(in_.x.size(0), 1, stream_);
@@ -94,7 +94,7 @@ class SubstepsBackward {
   void backward_obstacles(int64_t i, const T* nodes, const GridSums& sums);
   void keep_adjoint(const Adjoints& adjoints);
   void backward_kept(Adjoints& adjoints);
-  void backward_laws(Adjoints& adjoints);
+  void backward_laws(Adjoints& adjoints, const Tensor& dissipated);
 
   // Adds to each sum its term of the same strides, if there is one.
   void add_terms(std::initializer_list<std::pair<Tensor, Tensor>> sums) {
@@ -351,9 +351,10 @@ void SubstepsBackward<T, D>::backward_kept(Adjoints& adjoints) {
 }
 
 // Adjoint of the laws, the last one first: from F after the laws, stress and history to F and history before. A law
-// updates the adjoints of the quantities that it maps in place, and adds to those that it only reads.
+// updates the adjoints of the quantities that it maps in place, and adds to those that it only reads. `dissipated` is
+// the adjoint of the energy that becomes heat, or undefined.
 template <class T, int D>
-void SubstepsBackward<T, D>::backward_laws(Adjoints& adjoints) {
+void SubstepsBackward<T, D>::backward_laws(Adjoints& adjoints, const Tensor& dissipated) {
   int64_t parameter = int64_t(in_.parameters.size());
   for (size_t k = s_.calls.size(); k-- > 0;) {
     const LawCall& call = s_.calls[k];
@@ -367,6 +368,7 @@ void SubstepsBackward<T, D>::backward_laws(Adjoints& adjoints) {
                        : info.plastic || a.adds                ? adjoints.F
                                                                : F_term_);
     if (info.viscous) a.C = field<T>(adjoints.C);
+    if (s_.dissipates(k)) a.grad_dissipated = field<const T>(dissipated);
     if (!call.history.empty()) {
       a.grad_history = variable<const T, D>(field<const T>(adjoints.history), call.first_column, false);
       a.history = variable<T, D>(field<T>(adjoints.history), call.first_column, false);

@@ -5,7 +5,8 @@ import random
 
 import pytest
 import torch
-from heat_scenes import DT, LAWS, TRANSFERS, composed, scene
+from heat_scenes import DT, LAWS, TRANSFERS, bodies, composed, held, scene, terms
+from pairs import in_pairs
 
 import torch_mpm as mpm
 from torch_mpm import heat_boundaries
@@ -41,33 +42,33 @@ def with_leaves(step, state):
     return state, leaves
 
 
-def loss_of(end):
-    """A sum of all fields with random weights; the sine keeps large ones from hiding others."""
+def loss_of(end, of=STATE):
+    """A sum of fields with random weights; the sine keeps large ones from hiding others."""
     g, total = torch.Generator().manual_seed(1), 0.0
-    fields = [t for name in STATE[:5] if (t := getattr(end, name)) is not None]
-    for t in (*fields, end.temperature, *end.extra.values()):
+    fields = [t for name in of if name not in ("mass", "volume") and (t := getattr(end, name)) is not None]
+    for t in (*fields, *end.extra.values()):
         weight = torch.rand(t.shape, generator=g, dtype=F64).to(t)
         total = total + (weight * t.sin()).sum()
     return total
 
 
-def gradients(run, step, state, n, dt, **options):
-    """Gradients by all leaves, zero where a leaf takes no part."""
+def gradients(run, step, state, n, dt, of=STATE, **options):
+    """Gradients of a loss of some fields by all leaves, zero where a leaf takes no part."""
     state, leaves = with_leaves(step, state)
     if isinstance(dt, torch.Tensor):
         dt = leaves["dt"] = dt.detach().to(state.x.device).clone().requires_grad_(not step.flip)
     end = run(step, state, n, dt, **options)
     leaves = {name: leaf for name, leaf in leaves.items() if leaf.requires_grad}
-    grads = torch.autograd.grad(loss_of(end), list(leaves.values()), allow_unused=True, materialize_grads=True)
+    grads = torch.autograd.grad(loss_of(end, of), list(leaves.values()), allow_unused=True, materialize_grads=True)
     return dict(zip(leaves, grads, strict=True))
 
 
-def compare(step, state, n=6, dt=DT, tolerance=1e-10, **options):
+def compare(step, state, n=6, dt=DT, tolerance=1e-10, of=STATE, **options):
     """Gradients of the op are those of single steps, relative to the largest of each; returns the former."""
     step.heat.tolerance, state = 1e-12 if state.x.dtype == F64 else 1e-6, melting(state)
     assert plan_rollout(step, with_leaves(step, state)[0], n, dt).executor == "fused"
-    found = gradients(mpm.rollout, step, state, n, dt, **options)
-    expected = gradients(composed, step, state, n, dt)
+    found = gradients(mpm.rollout, step, state, n, dt, of, **options)
+    expected = gradients(composed, step, state, n, dt, of)
     assert found.keys() == expected.keys()
     for name, value in expected.items():
         scale = float(value.abs().max())
@@ -209,16 +210,61 @@ def test_differences_over_200_steps_with_melting(transfer, device):
         assert abs(found - expected) <= 1e-6 * max(abs(found), 0.01), f"{name}: {found} and {expected}"
 
 
+@pytest.mark.parametrize(*in_pairs(with_held=[False, True], name=[*terms(), "all"], dim=[2, 3], melts=[False, True]))
+def test_free_surface_and_sources(dim, name, with_held, melts, device):
+    """Terms of boundaries, alone, together and beside obstacles that hold the nodes in them."""
+    step, state = scene(dim, melts=melts, device=device)
+    step.heat.reference = 290.0
+    chosen = [t for own in terms().values() for t in own] if name == "all" else terms()[name]
+    step.heat.boundaries = chosen
+    if with_held:
+        region, plate = bodies(dim)["sphere"], bodies(dim)["plane"]
+        step = held(step, (heat_boundaries.Fixed, region, 40.0), (heat_boundaries.Fixed, plate, -5.0))
+        step.heat.boundaries = [*chosen, *step.heat.boundaries.entries]
+    compare(step, state, 4)
+
+
+@pytest.mark.parametrize("per_particle", [False, True])
+def test_boundaries_of_scenes(per_particle, device):
+    """Numbers of scenes, with time steps of their own."""
+    step, state = scene(2, scenes=3, device=device)
+    step.heat.reference = 290.0
+    chosen = [term for own in terms(3, len(state) if per_particle else 0).values() for term in own]
+    temperatures = torch.tensor([10.0, 20.0, 40.0], dtype=F64, device=device)
+    step = held(step, (heat_boundaries.Fixed, bodies(2)["plane"], temperatures))
+    step.heat.boundaries = [*chosen, *step.heat.boundaries.entries]
+    compare(step, state, 4, torch.tensor([1.0, 2.0, 0.5], dtype=F64) * DT)
+
+
+@pytest.mark.parametrize(
+    *in_pairs(name=["von_mises", "sand", "viscoelastic", "mixture"], dim=[2, 3], with_source=[False, True])
+)
+def test_plastic_heating(dim, name, with_source, device):
+    """The adjoint of the energy that laws dissipate, by all inputs of the laws."""
+    step, state = scene(dim, law=name, melts=with_source, device=device)
+    step.heat.plastic_heating, step.heat.specific_heat = 0.9, 1.0
+    state = state.replace(v=20 * state.v)
+    if with_source:
+        step.heat.boundaries = terms()["source"]
+    dt, of = DT if with_source else torch.tensor([DT], dtype=F64), ["temperature"]
+    found = compare(step, state, 4, dt, of=of)
+    step.heat.plastic_heating = 0.0
+    without = gradients(mpm.rollout, step, melting(state), 4, DT, of)
+    assert float((found["v"] - without["v"]).abs().max()) > 1e-6 * float(found["v"].abs().max())
+
+
 def test_reasons_for_single_steps(device):
     """What the op has no adjoint of."""
     step, state = scene(2, device=device)
     state = state.replace(temperature=state.temperature.clone().requires_grad_())
-    step.heat.boundaries = [heat_boundaries.Source(1.0)]
-    assert plan_rollout(step, state, 3, DT).reasons["fused"] == "its heat has boundaries, and a gradient is wanted"
-    step.heat.boundaries = []
+    region = bodies(2)["plane"]
+    step = held(step, (heat_boundaries.FixedSurface, region, 1.0))
+    reason = "a surface is held at a temperature, and a gradient is wanted"
+    assert plan_rollout(step, state, 3, DT).reasons["fused"] == reason
+    step = held(step, (heat_boundaries.Fixed, region, torch.tensor(1.0, dtype=F64, requires_grad=True)))
+    assert "temperature of Fixed is a function, or requires" in plan_rollout(step, state, 3, DT).reasons["fused"]
+    step = held(step, (heat_boundaries.Fixed, region, 1.0))
     assert plan_rollout(step, state, 3, DT).executor == "fused"
-    step.heat.plastic_heating = 0.5
-    assert "its heat has plastic heating, and a gradient" in plan_rollout(step, state, 3, DT).reasons["fused"]
 
 
 def test_adjoint_solves_that_miss_their_tolerance_are_reported(device):
@@ -242,9 +288,11 @@ def test_the_memory_is_known_beforehand():
 
 def test_raw_ops(device):
     step, state = scene(2, melts=True, scenes=2, device=device)
+    step.heat.boundaries = terms()["convection"]
     start, _ = with_leaves(step, melting(state))
     arguments = tuple(mpm.substeps_arguments(step, start, 2, DT).values())
-    torch.library.opcheck(torch.ops.torch_mpm.substeps.default, arguments)
+    checks = ("test_schema", "test_autograd_registration", "test_faketensor")
+    torch.library.opcheck(torch.ops.torch_mpm.substeps.default, arguments, test_utils=checks)
     results = torch.ops.torch_mpm.substeps(*arguments)
     grads = [None if t is None else torch.randn_like(t) for t in (*results[:6], results[7], results[10])]
     plain = [t.detach() if isinstance(t, torch.Tensor) else t for t in arguments]
@@ -252,6 +300,6 @@ def test_raw_ops(device):
         [t.detach() for t in v] if isinstance(v, list) and v and isinstance(v[0], torch.Tensor) else v for v in plain
     ]
     adjoint = (grads, 127, None, *plain)
-    torch.library.opcheck(torch.ops.torch_mpm.substeps_backward.default, adjoint)
+    torch.library.opcheck(torch.ops.torch_mpm.substeps_backward.default, adjoint, test_utils=checks)
     with pytest.raises(RuntimeError, match="grad_heat must have shape"):
         torch.ops.torch_mpm.substeps_backward([*grads[:7], grads[7][:, 1:]], *adjoint[1:])

@@ -54,5 +54,5 @@ def bytes_of_a_substep(state: State) -> int:
     D, size = state.x.shape[1], state.x.element_size()
     rows = len(state) + (0 if state.x.is_cuda else PADDING // size)
     history = sum(t[0].numel() for t in state.extra.values()) if len(state) else 0
-    heat = int(state.temperature is not None)  # Its other fields are in `extra`.
+    heat = 0 if state.temperature is None else 2  # With the dissipated energy; its other fields are in `extra`.
     return rows * (3 * (2 * D + 4 * D * D) // 2 + history + heat) * size

@@ -52,10 +52,8 @@ def why_not_fused_heat(step: Step, state: State, n: int, dt: float | Tensor) -> 
 
 def _why_no_adjoint(step: Step, heat: Heat) -> str | None:
     """Reason why the op has no gradients of the heat (`check_heat_has_gradients` in csrc/rollout); None if it has."""
-    if heat.boundaries.entries:
-        return "its heat has boundaries"
-    if heat.plastic_heating:
-        return "its heat has plastic heating"
+    if any(type(term) is FixedSurface for term in heat.boundaries.entries):
+        return "a surface is held at a temperature"
     if any(is_thermal(passive(law)) for law in laws_of(step.law)):
         return "a law reads the temperature"
     return None
