@@ -97,6 +97,14 @@ void heat_nodes_backward(const HeatNodesBackwardArguments<T, D>& a) {
   for_nodes(a.topology, [&](int scene, int64_t i) { heat_of_node_backward(a, scene, i); });
 }
 
+template <class T, int D>
+void heat_layers_backward(const HeatLayersBackwardArguments<T, D>& a) {
+  constexpr int64_t grain = 512;  // particles below which a range is not split
+  parallel_ranges(a.layers.particles, grain, [&](int64_t begin, int64_t end) {
+    for (int64_t p = begin; p < end; p++) heat_layer_backward(a, p);
+  });
+}
+
 template <int Order, class T, int D>
 void heat_to_nodes_backward(const HeatToNodesBackwardArguments<T, D>& a) {
   a.gradient.pointer ? from_nodes<Order, true>(a) : from_nodes<Order, false>(a);
@@ -106,6 +114,7 @@ void heat_to_nodes_backward(const HeatToNodesBackwardArguments<T, D>& a) {
 MPM_INSTANTIATE_ORDERS(heat_to_particles_backward, HeatToParticlesBackwardArguments)
 MPM_INSTANTIATE(heat_term_backward, HeatTermBackwardArguments)
 MPM_INSTANTIATE(heat_nodes_backward, HeatNodesBackwardArguments)
+MPM_INSTANTIATE(heat_layers_backward, HeatLayersBackwardArguments)
 MPM_INSTANTIATE_ORDERS(heat_to_nodes_backward, HeatToNodesBackwardArguments)
 
 }  // namespace TORCH_MPM_ISA

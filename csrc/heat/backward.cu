@@ -122,6 +122,11 @@ void heat_nodes_backward(const HeatNodesBackwardArguments<T, D>& a, Stream strea
   for_each<node_backward<T, D>>(nodes_of(a.topology), a, stream);
 }
 
+template <class T, int D>
+void heat_layers_backward(const HeatLayersBackwardArguments<T, D>& a, Stream stream) {
+  for_each<heat_layer_backward<T, D>>(a.layers.particles, a, stream);
+}
+
 template <int Order, class T, int D>
 void heat_to_nodes_backward(const HeatToNodesBackwardArguments<T, D>& a, Stream stream) {
   if (a.gradient.pointer)
@@ -133,6 +138,7 @@ void heat_to_nodes_backward(const HeatToNodesBackwardArguments<T, D>& a, Stream 
 MPM_INSTANTIATE_ORDERS(heat_to_particles_backward, HeatToParticlesBackwardArguments)
 MPM_INSTANTIATE(heat_term_backward, HeatTermBackwardArguments)
 MPM_INSTANTIATE(heat_nodes_backward, HeatNodesBackwardArguments)
+MPM_INSTANTIATE(heat_layers_backward, HeatLayersBackwardArguments)
 MPM_INSTANTIATE_ORDERS(heat_to_nodes_backward, HeatToNodesBackwardArguments)
 
 }  // namespace mpm::cuda

@@ -3,7 +3,7 @@
 #include "heat/local.h"
 #include "pointwise/heat.h"
 
-// Adjoint of a step of heat without held surfaces, as torch_mpm/heat/heat.py computes the step. Particles gather
+// Adjoint of a step of heat, as torch_mpm/heat/heat.py computes the step. Particles gather
 // the adjoint of G2P, nodes have that of the solve (heat_cg in torch_mpm/ops/heat.py), and particles gather that of
 // P2G. The formulas are those of the step, differentiated by dual numbers (pointwise/heat.h).
 namespace mpm {
@@ -50,8 +50,22 @@ struct HeatNodesBackwardArguments {
   const bool* fixed = nullptr;
   Field<const T> scene_dt;
   double dt = 0;
+  const T* temperature = nullptr;  // of the held surface in scene b at temperature + b * stride, absent without one
+  int64_t stride = 0;
+  T* layer = nullptr;  // [N], adjoint of its exchange
   T* forms = nullptr;  // [N, kHeatForms]: adjoints of the sums; increment, θ̄, θ + d and λ
   T* rate = nullptr;   // λ d/dt², whose sum with the heat capacities is the adjoint of dt; may be absent
+};
+
+// Adjoint of the layer of particles around a held surface.
+template <class T, int D>
+struct HeatLayersBackwardArguments {
+  HeatToNodesArguments<T, D> down;
+  HeatLayersArguments<T, D> layers;  // its results are unused
+  Field<const T> exchange;           // gathered adjoint of the exchange of the particles
+  Field<const T> moment;             // [P, kHeatForms, D] with ∇(θ + d) and ∇λ
+  Field<T> conductance;              // adjoint of κ V
+  Field<T> x;                        // adjoint of the position by the distance from the surface
 };
 
 // Adjoint of P2G and of the weights of the particles.
@@ -66,6 +80,7 @@ struct HeatToNodesBackwardArguments {
   Field<T> surface_value, surface_gradient;  // [P, 1 + D], [P, 1 + D, D]: gathered adjoints of its sums, then forms
   Field<T> dissipated;                       // adjoint of the energy that laws dissipate, written; may be absent
   double inverse_inertia = 1;                // D⁻¹ [1/m²]
+  Field<const T> conductance;                // adjoint of κ V, where a layer has changed it; or absent
   Field<T> value, moment;    // forms: those of P2G are written, ∇(θ + d) and ∇λ become those of the solve
   Field<T> theta, gradient;  // adjoints, added, as those below
   Field<T> velocity_gradient;
@@ -236,6 +251,7 @@ MPM_HD void heat_of_node_backward(const HeatNodesBackwardArguments<T, D>& a, int
   form[kHeatAfter] = theta + increment;
   form[kHeatMultiplier] = multiplier;
   if (a.rate) a.rate[i] = rate / dt;
+  if (a.layer) a.layer[i] = multiplier * (a.temperature[scene * a.stride] - (theta + increment));
 }
 
 // Adjoint of κ V by λ · H (θ + d) = Σ_p κ V ∇(θ + d) · ∇λ, which the equation of the solve subtracts; the gradients in
@@ -251,6 +267,46 @@ MPM_HD typename At::Value pull_back_conduction(const HeatToNodesBackwardArgument
   store_vector<D>(at, after, scale * of_multiplier);
   store_vector<D>(at, multiplier, scale * of_after);
   return -dot(of_after, of_multiplier);
+}
+
+// Signed distance of a particle from the held surface, and its derivative along an axis: that of a surface which moves
+// the other way.
+template <class T, int D>
+MPM_HD Dual<T> distance_along(const HeatLayersArguments<T, D>& a, int scene, const Vector<T, D>& x, int axis) {
+  using S = Dual<T>;
+  const ObstacleRow<T, D>& row = rows_of_scene(a.contact, scene)[a.obstacle];
+  ObstacleRow<S, D> moved;
+  const T* const values = reinterpret_cast<const T*>(&row);
+  S* const lifted = reinterpret_cast<S*>(&moved);
+  for (int k = 0; k < ObstacleRow<T, D>::width; k++) lifted[k] = S(values[k], T(0));
+  moved.position[axis].derivative = T(-1);
+  return distance_from(obstacle_pose(a.contact, a.contact.kind[a.obstacle], moved, scene), x);
+}
+
+// At any particle: its conductance κ V, of which a share remains and another is exchanged, and its distance.
+template <class T, int D>
+MPM_HD void heat_layer_backward(const HeatLayersBackwardArguments<T, D>& a, int64_t p) {
+  const One<T> at{p};
+  const Vector<T, D> after = load_vector<D>(at, entry(a.moment, kHeatAfter)), x = load_vector<D>(at, a.layers.x);
+  const T by_rest = -dot(after, load_vector<D>(at, entry(a.moment, kHeatMultiplier)));
+  const T by_exchange = load_scalar(at, a.exchange) - by_rest / T(a.layers.inverse_inertia);
+  const int scene = scene_of_particle(a.layers, p);
+  const T distance = distance_from(pose_of(a.layers.contact, a.layers.obstacle, scene), x), width = T(a.layers.width);
+  store_scalar(at, a.conductance, by_rest);
+  store_vector<D>(at, a.x, zero_vector<T, D>());
+  if (distance >= width || (by_rest == T(0) && by_exchange == T(0))) return;  // the latter outside the grid
+  const HeatLayerAt<Dual<T>> layer = heat_layer(Dual<T>(distance, T(1)), Dual<T>(width, T(0)));
+  store_scalar(at, a.conductance, layer.share.value * by_rest + layer.rate.value * by_exchange);
+  const HeatToNodesArguments<T, D>& f = a.down;
+  const T conductance = heat_weights<T, D>(load_scalar(at, f.particles.volume), load_value(at, f.specific_heat, scene),
+                                           load_value(at, f.conductivity, scene), load_scalar(at, f.mass),
+                                           step_of_scene(f.scene_dt, f.dt, scene),
+                                           load_matrix<D>(at, f.velocity_gradient), f.topology.geometry.dx)
+                            .conductance;
+  const T by_distance = conductance * (layer.share.derivative * by_rest + layer.rate.derivative * by_exchange);
+  Vector<T, D> grad;
+  for (int i = 0; i < D; i++) grad[i] = by_distance * distance_along(a.layers, scene, x, i).derivative;
+  store_vector<D>(at, a.x, grad);
 }
 
 // Power of a particle by the energy that its law dissipates.
@@ -326,7 +382,7 @@ MPM_HD void heat_of_nodes_backward(const HeatToNodesBackwardArguments<T, D>& a, 
   arguments.put(load_matrix<D>(at, f.velocity_gradient));
   arguments.put(V(f.topology.geometry.dx));
   Weights::evaluate(in, weights);
-  const V capacity = weights[1], conductance = weights[2], blend = blend_of(f.transfer, weights[3]);
+  const V capacity = weights[1], blend = blend_of(f.transfer, weights[3]);
 
   V sums[Moments::kIn], of_nodes[Moments::kOut], adjoint[Moments::kOut], grad[Moments::kIn];
   Writer<V, D> of_sums{sums}, adjoints{adjoint};
@@ -354,7 +410,8 @@ MPM_HD void heat_of_nodes_backward(const HeatToNodesBackwardArguments<T, D>& a, 
   if (a.gradient.pointer) store_vector<D>(Adding<At>(at), a.gradient, gradient);
 
   const V by_capacity = by_sums.scalar(), by_blend = by_sums.scalar() + load_scalar(at, a.blend);
-  const V by_conductance = pull_back_conduction(a, at, conductance);
+  const V by_rest = pull_back_conduction(a, at, load_scalar(at, constant(f.conductance)));
+  const V by_conductance = a.conductance.pointer ? load_scalar(at, a.conductance) : by_rest;
   const V by_volume = a.surface_value.pointer ? pull_back_surface(a, at, scene, weights[0], dt) : V(0);
   if (a.rate.pointer) add_scalar(at, a.dt, capacity * load_scalar(at, a.rate));
   const V of_weights[] = {by_volume, by_capacity, by_conductance, f.transfer == HeatTransfer::hybrid ? by_blend : V(0),

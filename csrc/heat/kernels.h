@@ -34,5 +34,6 @@ MPM_BACKEND_KERNELS(MPM_HEAT_TRANSFER_KERNELS)
   ORDERED(heat_to_particles_backward, HeatToParticlesBackwardArguments) \
   PLAIN(heat_term_backward, HeatTermBackwardArguments)                  \
   PLAIN(heat_nodes_backward, HeatNodesBackwardArguments)                \
+  PLAIN(heat_layers_backward, HeatLayersBackwardArguments)              \
   ORDERED(heat_to_nodes_backward, HeatToNodesBackwardArguments)
 MPM_BACKEND_KERNELS(MPM_HEAT_BACKWARD_KERNELS)

@@ -34,11 +34,11 @@ MPM_HD void heat_volume(const HeatVolumesArguments<T, D>& a, int64_t p) {
 
 // Signed distance from an obstacle; infinite while it is not there. The kernel of contact needs no distance from the
 // edges of a box.
-template <class T, int D>
-MPM_HD T distance_from(const ObstaclePose<T, D>& pose, const Vector<T, D>& position) {
-  if (!pose.acts) return T(INFINITY);
-  const Vector<T, D> body = to_body(pose, position);
-  Vector<T, D> other;
+template <class S, int D>
+MPM_HD S distance_from(const ObstaclePose<S, D>& pose, const Vector<ValueOf<S>, D>& position) {
+  if (!pose.acts) return lift<S>(ValueOf<S>(INFINITY));
+  const Vector<S, D> body = to_body(pose, position);
+  Vector<S, D> other;
   if (pose.shape != ObstacleShape::box) return surface(pose, body, other);
   MPM_UNROLL for (int i = 0; i < D; i++)
     other[i] = pose.row->extent[i];

@@ -34,6 +34,7 @@ class HeatBackward {
     if (heat().has_terms()) adjoint_of_terms(solution);
     adjoint_of_nodes(solution, adjoints.dt.defined());
     gather(solution.down, adjoints.dt.defined());
+    if (heat().holds_surface()) adjoint_of_layers(solution.down);
     backend::heat_to_nodes_backward(order(), to_nodes(i, solution.down, adjoints), stream_);
     position_gradient(solution.down);
   }
@@ -54,6 +55,7 @@ class HeatBackward {
   void scatter(const HeatToParticlesBackwardArguments<T, D>& up);
   void solve(HeatArguments<T, D> system, const Tensor& status);
   void adjoint_of_terms(const HeatSolution<T, D>& solution);
+  void adjoint_of_layers(const HeatToNodesArguments<T, D>& down);
   void adjoint_of_nodes(const HeatSolution<T, D>& solution, bool by_dt);
   void gather(const HeatToNodesArguments<T, D>& down, bool by_dt);
   HeatToNodesBackwardArguments<T, D> to_nodes(int64_t i, const HeatToNodesArguments<T, D>& down,
@@ -66,8 +68,10 @@ class HeatBackward {
   Tensor value_, moment_, blend_, rate_of_particles_;  // [P, kHeatForms], [P, kHeatForms, D], [P], [P, 1]
   int64_t nodes_ = -1;
   Tensor adjoints_, source_, multiplier_, product_, forms_, rate_;  // of the nodes
-  Tensor surface_, by_terms_;                // adjoints of the sums of the free surface, and of θ by the terms
-  Tensor surface_value_, surface_gradient_;  // [P, 1 + D], [P, 1 + D, D]
+  // Adjoints of the sums of the free surface, and of θ by the terms; [P, 1 + D], [P, 1 + D, D].
+  Tensor surface_, by_terms_, surface_value_, surface_gradient_;
+  // Of a held surface: adjoint of the exchange of the nodes, and gathered [P, 1]; of κ V [P], and of x [P, D].
+  Tensor layer_, layer_of_particles_, by_conductance_, x_layer_;
   Tensor iterations_, residual_, converged_, workspace_, operator_workspace_;
 };
 
@@ -85,6 +89,9 @@ HeatBackward<T, D>::HeatBackward(Recorded<T, D>& record, const SubstepsInputs& i
   torch::stable::zero_(moment_);
   blend_ = empty(x, {P});
   dissipated = result(x, heat().heats_by_laws(), {P});
+  layer_of_particles_ = result(x, heat().holds_surface(), {P, 1});
+  by_conductance_ = result(x, heat().holds_surface(), {P});
+  x_layer_ = result(x, heat().holds_surface(), {P, D});
   surface_value_ = result(x, heat().has_terms(), {P, 1 + D});
   surface_gradient_ = result(x, heat().has_terms(), {P, 1 + D, D});
   iterations_ = empty_int(x, {in.scenes});
@@ -100,6 +107,7 @@ void HeatBackward<T, D>::make_nodes(const HeatSolution<T, D>& solution) {
   for (Tensor* t : {&source_, &multiplier_, &product_, &rate_}) *t = empty(in_.x, {nodes});
   adjoints_ = empty(in_.x, {nodes, 2});
   forms_ = empty(in_.x, {nodes, kHeatForms});
+  if (heat().holds_surface()) layer_ = empty(in_.x, {nodes});
   if (heat().has_terms()) surface_ = empty(in_.x, {nodes, kHeatChannels}), by_terms_ = empty(in_.x, {nodes});
   workspace_ = operator_workspace_ = Tensor();
 }
@@ -196,6 +204,12 @@ void HeatBackward<T, D>::adjoint_of_nodes(const HeatSolution<T, D>& solution, bo
   a.exchange = solution.system.exchange;
   if (heat().has_terms()) a.by_terms = rows(by_terms_);
   a.fixed = solution.system.fixed;
+  if (heat().holds_surface()) {
+    const HeatFromSurfaceArguments<T, D> held = heat().from_surface();
+    a.temperature = held.temperature;
+    a.stride = held.stride;
+    a.layer = rows(layer_);
+  }
   a.scene_dt = solution.down.scene_dt;
   a.dt = solution.down.dt;
   a.forms = rows(forms_);
@@ -243,6 +257,7 @@ HeatToNodesBackwardArguments<T, D> HeatBackward<T, D>::to_nodes(int64_t i, const
   if (adjoints.dt.defined()) a.rate = constant(HeatSteps<T, D>::column_of(rate_of_particles_, 0));
   a.inverse_inertia = in_.lattice.inverse_inertia();
   if (heat().has_terms()) a.surface = heat().surface(before.x, a.rest);
+  a.conductance = field<const T>(by_conductance_);
   a.surface_value = field<T>(surface_value_);
   a.surface_gradient = field<T>(surface_gradient_);
   a.dissipated = field<T>(dissipated);
@@ -260,7 +275,26 @@ HeatToNodesBackwardArguments<T, D> HeatBackward<T, D>::to_nodes(int64_t i, const
   return a;
 }
 
-// Of all forms: those of the step at once, and those of the free surface.
+// Particles around the held surface: their exchange at the nodes, the rest of their conductance and their distance.
+template <class T, int D>
+void HeatBackward<T, D>::adjoint_of_layers(const HeatToNodesArguments<T, D>& down) {
+  GatherArguments<T, D> gather;
+  gather.topology = down.topology;
+  gather.x = down.x;
+  gather.nodes = {rows(layer_), 1, 1};
+  gather.value = field<T>(layer_of_particles_);
+  backend::gather(order(), gather, stream_);
+  HeatLayersBackwardArguments<T, D> a;
+  a.down = down;
+  a.layers = heat().layers(down.x, record_.scene_of_particles());
+  a.exchange = constant(HeatSteps<T, D>::column_of(layer_of_particles_, 0));
+  a.moment = field<const T>(moment_);
+  a.conductance = field<T>(by_conductance_);
+  a.x = field<T>(x_layer_);
+  backend::heat_layers_backward(a, stream_);
+}
+
+// Of all forms: those of the step at once, those of the free surface, and that of the exchange of a held surface.
 template <class T, int D>
 void HeatBackward<T, D>::position_gradient(const HeatToNodesArguments<T, D>& down) {
   PositionGradientArguments<T, D> a;
@@ -271,12 +305,20 @@ void HeatBackward<T, D>::position_gradient(const HeatToNodesArguments<T, D>& dow
   a.nodes = {rows(forms_), kHeatForms, kHeatForms};
   a.position_gradient = field<T>(x_term);
   backend::position_gradient(order(), a, stream_);
+  a.moment = {};
+  a.adds = true;
+  if (heat().holds_surface()) {
+    a.value = field<const T>(heat().exchange_of_particles());
+    a.nodes = {rows(layer_), 1, 1};
+    backend::position_gradient(order(), a, stream_);
+    const Field<T> sum = field<T>(x_term);
+    backend::add_scaled(AddScaledArguments<T, D>{in_.x.size(0), sum, constant(sum), field<const T>(x_layer_), 1},
+                        stream_);
+  }
   if (!heat().has_terms()) return;
   a.value = field<const T>(surface_value_);
-  a.moment = {};
   a.gradient = field<const T>(surface_gradient_);
   a.nodes = {rows(surface_), kHeatChannels, 1 + D};
-  a.adds = true;
   backend::position_gradient(order(), a, stream_);
 }
 

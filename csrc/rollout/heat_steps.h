@@ -99,11 +99,15 @@ class HeatSteps {
   std::vector<HeatTermArguments<T, D>> terms() const;
   HeatSurfaceArguments<T, D> surface(const Field<const T>& x, const Field<const T>& rest) const;
 
+  // The last of the held obstacles is held at its surface, the others at the nodes in them.
+  bool holds_surface() const { return in_.heat_options[2] != 0; }
+  HeatLayersArguments<T, D> layers(const Field<const T>& x, const Field<const int>& scene) const;
+  HeatFromSurfaceArguments<T, D> from_surface() const;
+  const Tensor& exchange_of_particles() const { return exchange_of_particles_; }
+
  private:
   int64_t particles() const { return in_.x.size(0); }
   int64_t held_nodes() const { return int64_t(in_.held_obstacles.size()) - holds_surface(); }
-  // The last of the held obstacles is held at its surface, the others at the nodes in them.
-  bool holds_surface() const { return in_.heat_options[2] != 0; }
   // Tensors of the boundaries: held temperatures, numbers of the terms, power of the source; absent ones are empty.
   enum Boundaries : size_t { kHeld, kNumbers, kPower, kBoundaries };
   bool given(Boundaries k) const { return !in_.heat_boundaries.empty() && in_.heat_boundaries[k].numel() > 0; }
@@ -154,12 +158,11 @@ class HeatSteps {
   Tensor sums_, theta_, capacity_, increment_, iterations_, residual_, converged_, workspace_;
 };
 
-// The adjoint has no held surfaces, and no laws that read temperatures (torch_mpm/rollouts/fused_heat.py).
+// The adjoint has no laws that read temperatures (torch_mpm/rollouts/fused_heat.py).
 inline void check_heat_has_gradients(const SubstepsInputs& in) {
-  const bool holds_surface = in.heat_options.size() > 2 && in.heat_options[2] != 0;
-  STD_TORCH_CHECK(!holds_surface && in.thermal.empty() && in.laws.find('~') == std::string::npos,
-                  "heat with a held surface or with laws that read the temperature is computed without gradients: "
-                  "records must be false, and resident true");
+  STD_TORCH_CHECK(in.thermal.empty() && in.laws.find('~') == std::string::npos,
+                  "heat with laws that read the temperature is computed without gradients: records must be false, and "
+                  "resident true");
 }
 
 template <class T, int D>
@@ -240,11 +243,10 @@ void HeatSteps<T, D>::check_held() {
   if (holds_surface()) exchange_of_particles_ = empty(in_.x, {particles(), 1});
 }
 
-// The layer of particles near the held surface: the rest of their conductance, and their exchange at the nodes.
+// The layer of particles near the held surface.
 template <class T, int D>
-void HeatSteps<T, D>::add_layers(const Field<const T>& x, const Field<const int>& scene, backend::Stream stream) {
+HeatLayersArguments<T, D> HeatSteps<T, D>::layers(const Field<const T>& x, const Field<const int>& scene) const {
   constexpr double kWidth = 2;  // in dx, `WIDTH` of FixedSurface
-  const int64_t k = int64_t(in_.held_obstacles.size()) - 1;
   HeatLayersArguments<T, D> a;
   a.contact = s_.contact;
   a.particles = particles();
@@ -256,7 +258,13 @@ void HeatSteps<T, D>::add_layers(const Field<const T>& x, const Field<const int>
   a.inverse_inertia = in_.lattice.inverse_inertia();
   a.conductance = field<T>(conductance_);
   a.exchange = column(field<T>(exchange_of_particles_), 0);
-  backend::heat_layers(a, stream);
+  return a;
+}
+
+// The rest of the conductance in the layer, and its exchange at the nodes.
+template <class T, int D>
+void HeatSteps<T, D>::add_layers(const Field<const T>& x, const Field<const int>& scene, backend::Stream stream) {
+  backend::heat_layers(layers(x, scene), stream);
   T* const exchange = static_cast<T*>(exchange_.data_ptr());
   ScatterArguments<T, D> down;
   down.topology = s_.p2g.topology;
@@ -265,10 +273,14 @@ void HeatSteps<T, D>::add_layers(const Field<const T>& x, const Field<const int>
   down.deterministic = in_.lattice.deterministic();
   down.nodes = {exchange, 1, 1};
   backend::scatter(in_.lattice.order(), down, stream);
-  backend::heat_from_surface(
-      HeatFromSurfaceArguments<T, D>{s_.p2g.topology, held_temperature(k), temperatures_.stride[1], exchange,
-                                     static_cast<T*>(source_.data_ptr())},
-      stream);
+  backend::heat_from_surface(from_surface(), stream);
+}
+
+// Heat from the held surface.
+template <class T, int D>
+HeatFromSurfaceArguments<T, D> HeatSteps<T, D>::from_surface() const {
+  return {s_.p2g.topology, held_temperature(int64_t(in_.held_obstacles.size()) - 1), temperatures_.stride[1],
+          static_cast<const T*>(exchange_.data_ptr()), static_cast<T*>(source_.data_ptr())};
 }
 
 // Sets which nodes stay at which temperatures.

@@ -101,6 +101,8 @@ class Recorded {
   // False as for `run`.
   bool return_to(int64_t i);
 
+  Field<const int> scene_of_particles() const { return {steps.activation.scene, {steps.activation.scene_stride}}; }
+
   // Computes the node temperatures of that step again.
   HeatSolution<T, D> conduct_again(int64_t i) {
     Tensor before = heat->state();
@@ -174,8 +176,6 @@ class Recorded {
     }
     if (scene_times_.defined()) steps.contact.scene_time = scene_time(i);
   }
-
-  Field<const int> scene_of_particles() const { return {steps.activation.scene, {steps.activation.scene_stride}}; }
 
   void begin_heat(int64_t i) {
     heat->begin(state(i).F, state(i).J, steps.p2g.volume, stream_);

@@ -405,6 +405,8 @@ Gradients substeps_backward(const std::vector<OptionalTensor>& grads, int64_t ne
   const SubstepsInputs in{MPM_SUBSTEPS_ARGUMENTS};
   check_positions(x);
   check_heat_has_gradients(in);
+  const bool holds_surface = in.heat_options.size() > 2 && in.heat_options[2] != 0;
+  STD_TORCH_CHECK(!holds_surface || !(needs & kObstacles), "obstacles have no gradients where heat holds a surface");
   STD_TORCH_CHECK(grads.size() == kResults, "grads must have ", size_t(kResults), " entries, got ", grads.size());
   const int64_t P = x.size(0);
   Adjoints adjoints;

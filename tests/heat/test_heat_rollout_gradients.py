@@ -224,6 +224,17 @@ def test_free_surface_and_sources(dim, name, with_held, melts, device):
     compare(step, state, 4)
 
 
+@pytest.mark.parametrize(*in_pairs(shape=bodies(2), dim=[2, 3], melts=[False, True], others=[False, True]))
+def test_held_surfaces(dim, shape, melts, others, device):
+    """Of obstacles of all shapes, alone, and beside terms of the free surface and nodes that are held."""
+    step, state = scene(dim, melts=melts, device=device)
+    chosen = [t for own in terms().values() for t in own] if others else []
+    held_nodes = [(heat_boundaries.Fixed, mpm.Plane((0.0, 0.3, 0.0)[:dim], (0.0, 1.0, 0.0)[:dim]), -5.0)]
+    step = held(step, (heat_boundaries.FixedSurface, bodies(dim)[shape], 40.0), *(held_nodes if others else []))
+    step.heat.boundaries = [*chosen, *step.heat.boundaries.entries]
+    compare(step, state, 4)
+
+
 @pytest.mark.parametrize("per_particle", [False, True])
 def test_boundaries_of_scenes(per_particle, device):
     """Numbers of scenes, with time steps of their own."""
@@ -231,7 +242,12 @@ def test_boundaries_of_scenes(per_particle, device):
     step.heat.reference = 290.0
     chosen = [term for own in terms(3, len(state) if per_particle else 0).values() for term in own]
     temperatures = torch.tensor([10.0, 20.0, 40.0], dtype=F64, device=device)
-    step = held(step, (heat_boundaries.Fixed, bodies(2)["plane"], temperatures))
+    region = bodies(2)["sphere"] if per_particle else mpm.Sphere((0.4, 0.3), 0.1, scene=1)
+    step = held(
+        step,
+        (heat_boundaries.FixedSurface, region, temperatures.flip(0)),
+        (heat_boundaries.Fixed, bodies(2)["plane"], temperatures),
+    )
     step.heat.boundaries = [*chosen, *step.heat.boundaries.entries]
     compare(step, state, 4, torch.tensor([1.0, 2.0, 0.5], dtype=F64) * DT)
 
@@ -259,8 +275,11 @@ def test_reasons_for_single_steps(device):
     state = state.replace(temperature=state.temperature.clone().requires_grad_())
     region = bodies(2)["plane"]
     step = held(step, (heat_boundaries.FixedSurface, region, 1.0))
-    reason = "a surface is held at a temperature, and a gradient is wanted"
+    assert plan_rollout(step, state, 3, DT).executor == "fused"
+    step.boundaries = [*step.boundaries.entries, mpm.Sphere(torch.tensor([0.1, 0.1], requires_grad=True), 0.05)]
+    reason = "a surface is held at a temperature, and a gradient is wanted by an obstacle"
     assert plan_rollout(step, state, 3, DT).reasons["fused"] == reason
+    step.boundaries = step.boundaries.entries[:-1]
     step = held(step, (heat_boundaries.Fixed, region, torch.tensor(1.0, dtype=F64, requires_grad=True)))
     assert "temperature of Fixed is a function, or requires" in plan_rollout(step, state, 3, DT).reasons["fused"]
     step = held(step, (heat_boundaries.Fixed, region, 1.0))

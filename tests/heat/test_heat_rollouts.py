@@ -445,7 +445,7 @@ def test_raw_op():
         "the adjoint tolerance must be between 0 and 1": {"heat_scalars": [0.5, 0.0, 0.0, 0.0]},
         "iterations must be positive": {"heat_options": [0, 0, 0]},
         "heat needs wants_C": {"wants_C": False, "apic": False},
-        "without gradients": {"resident": False, "heat_options": [0, 9, 1]},
+        "without gradients": {"resident": False, "thermal": [0, -1, 0], "tables": [ones[:2, None]]},
         "heat_boundaries must be empty or 3 tensors, got 2": {"heat_boundaries": [none, none]},
         "held_obstacles must be 0 to 0, got 1": {
             "held_obstacles": [1],
@@ -475,7 +475,7 @@ def test_raw_op():
 
 @pytest.mark.parametrize("kind", [None, heat_boundaries.Fixed, heat_boundaries.FixedSurface])
 def test_gradients_of_paths(kind):
-    """Heat without held surfaces is differentiated by the op, other heat step by step."""
+    """Only the distance from a held surface is differentiated step by step."""
     ends = []
     for run in (mpm.rollout, composed):
         step, state = scene(2)

@@ -145,10 +145,22 @@ def wants_gradient(steps: Steps, state: State) -> bool:
     """Whether the fused op is differentiated. Functions of time are called at the first and the last of the steps."""
     if not torch.is_grad_enabled():
         return False
+    step, _, dt, *_ = steps
+    assert isinstance(step, Step)
+    return differentiates(step, state, dt) or _paths_require_grad(steps, state)
+
+
+def obstacles_require_grad(steps: Steps, state: State) -> bool:
+    """Whether a tensor of an obstacle, or one of its positions on a path, requires grad."""
+    step = steps.step
+    assert isinstance(step, Step)
+    tensors = [t for b in _obstacles(step) for t in motion_tensors(b)]
+    return any([t.requires_grad for t in tensors]) or _paths_require_grad(steps, state)
+
+
+def _paths_require_grad(steps: Steps, state: State) -> bool:
     step, n, dt, *_ = steps
     assert isinstance(step, Step)
-    if differentiates(step, state, dt):
-        return True
     if not follows_paths(step):
         return False
     times = StepTimes.of(state, n, dt, step.grid.scenes)

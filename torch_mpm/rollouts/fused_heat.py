@@ -25,7 +25,7 @@ from ..laws.thermal import LIQUID
 from ..laws.thermal_calls import is_thermal
 from ..state.state import State
 from ..step.step import Step
-from .facts import wants_gradient
+from .facts import obstacles_require_grad, wants_gradient
 from .steps import Steps
 
 
@@ -45,17 +45,12 @@ def why_not_fused_heat(step: Step, state: State, n: int, dt: float | Tensor) -> 
         return "it conducts heat with another stress form than mls"
     if any(_is_function(value) for value in heat.parameter_values):
         return "a parameter of its heat is a function"
-    if (reason := _why_no_adjoint(step, heat)) is not None and wants_gradient(Steps(step, n, dt), state):
-        return f"{reason}, and a gradient is wanted"
-    return None
-
-
-def _why_no_adjoint(step: Step, heat: Heat) -> str | None:
-    """Reason why the op has no gradients of the heat (`check_heat_has_gradients` in csrc/rollout); None if it has."""
-    if any(type(term) is FixedSurface for term in heat.boundaries.entries):
-        return "a surface is held at a temperature"
-    if any(is_thermal(passive(law)) for law in laws_of(step.law)):
-        return "a law reads the temperature"
+    steps = Steps(step, n, dt)
+    if any(is_thermal(passive(law)) for law in laws_of(step.law)) and wants_gradient(steps, state):
+        return "a law reads the temperature, and a gradient is wanted"  # `check_heat_has_gradients` in csrc/rollout
+    surface = any(type(term) is FixedSurface for term in heat.boundaries.entries)
+    if surface and torch.is_grad_enabled() and obstacles_require_grad(steps, state):
+        return "a surface is held at a temperature, and a gradient is wanted by an obstacle"
     return None
 
 
