@@ -127,6 +127,19 @@ struct HeatGathered {
   Vector<V, D> moment[Channels];
 };
 
+// Derivatives of a sum by the first `count` of its inputs; f returns its derivative at dual inputs.
+template <int N, class V, class F>
+MPM_HD void pull_back(const V (&in)[N], V (&grad)[N], int count, const F& f) {
+  Dual<V> x[N];
+  MPM_UNROLL for (int n = 0; n < N; n++)
+    x[n] = {in[n], V(0)};
+  for (int n = 0; n < count; n++) {
+    x[n].derivative = V(1);
+    grad[n] = f(x);
+    x[n].derivative = V(0);
+  }
+}
+
 // Replaces the adjoints of θ and the liquid fraction by those before melting; θ is that after G2P.
 template <class At, class T, int D>
 MPM_HD void pull_back_melting(const HeatToParticlesBackwardArguments<T, D>& a, const At& at, int scene,
@@ -150,6 +163,49 @@ MPM_HD void pull_back_melting(const HeatToParticlesBackwardArguments<T, D>& a, c
   add_parameter(at, a.parameters, kLatentHeat, grad[4]);
 }
 
+// Adjoints of the inputs of `blended`; that of β is added.
+template <class V>
+struct BlendedAdjoint {
+  V increment, average, before;
+};
+
+template <class V>
+MPM_HD BlendedAdjoint<V> pull_back_blended(const V& increment, const V& average, const V& before, const V& blend,
+                                           const V& adjoint, V& by_blend) {
+  const V in[] = {increment, average, before, blend};
+  V grad[4];
+  pull_back(in, grad, 4, [&](const Dual<V>(&x)[4]) { return adjoint * blended(x[0], x[1], x[2], x[3]).derivative; });
+  by_blend = by_blend + grad[3];
+  return {grad[0], grad[1], grad[2]};
+}
+
+// Replaces the adjoint of the gradient after its transport by that before it; those of ∇v and dt are added.
+template <class At, class T, int D>
+MPM_HD void pull_back_transport(const HeatToParticlesBackwardArguments<T, D>& a, const At& at,
+                                const Vector<typename At::Value, D>& gradient, const typename At::Value& dt,
+                                Vector<typename At::Value, D>& adjoint) {
+  using V = typename At::Value;
+  V in[D + D * D + 1], grad[D + D * D + 1];
+  Writer<V, D> arguments{in};
+  arguments.put(gradient);
+  arguments.put(load_matrix<D>(at, a.forward.velocity_gradient));
+  arguments.put(dt);
+  pull_back(in, grad, a.dt.pointer ? D + D * D + 1 : D + D * D, [&](const Dual<V>(&x)[D + D* D + 1]) {
+    Reader<Dual<V>, D> read{x};
+    const Vector<Dual<V>, D> before = read.vector();
+    const Matrix<Dual<V>, D> L = read.matrix();
+    const Vector<Dual<V>, D> after = transported_gradient(before, L, read.scalar());
+    V sum = adjoint[0] * after[0].derivative;
+    MPM_UNROLL for (int d = 1; d < D; d++)
+      sum = sum + adjoint[d] * after[d].derivative;
+    return sum;
+  });
+  Reader<V, D> read{grad};
+  adjoint = read.vector();
+  store_matrix<D>(Adding<At>(at), a.velocity_gradient, read.matrix());
+  if (a.dt.pointer) add_scalar(at, a.dt, read.scalar());
+}
+
 // At particles inside the grid, from the increment and θ̄; the moments are times D⁻¹. Particles outside keep their
 // temperature, so that its adjoint is unchanged.
 template <bool Affine, class At, class T, int D>
@@ -157,41 +213,32 @@ MPM_HD void heat_of_particles_backward(const HeatToParticlesBackwardArguments<T,
                                        const typename At::Value& dt,
                                        const HeatGathered<typename At::Value, D, 2>& gathered) {
   using V = typename At::Value;
-  using Update = Applied<HeatUpdate<2>, D>;
   const HeatToParticlesArguments<T, D>& f = a.forward;
-  V in[Update::kIn], out[Update::kOut], adjoint[Update::kOut], grad[Update::kIn];
-  Writer<V, D> arguments{in}, adjoints{adjoint};
-  MPM_UNROLL for (const V& value : gathered.value)
-    arguments.put(value);
-  MPM_UNROLL for (const Vector<V, D>& moment : gathered.moment)
-    arguments.put(moment);
-  arguments.put(load_scalar(at, f.particles.theta));
-  arguments.put(Affine ? load_vector<D>(at, f.particles.gradient) : zero_vector<V, D>());
-  arguments.put(load_scalar(at, f.blend));
-  arguments.put(load_matrix<D>(at, f.velocity_gradient));
-  arguments.put(dt);
-  V grad_theta = load_scalar(at, constant(a.theta));
-  if (a.liquid.pointer) {
-    Update::evaluate(in, out);
-    pull_back_melting(a, at, scene, out[0], grad_theta);
+  const V theta = load_scalar(at, f.particles.theta), blend = load_scalar(at, f.blend);
+  V by_theta = load_scalar(at, constant(a.theta)), by_blend(0);
+  if (a.liquid.pointer)
+    pull_back_melting(a, at, scene, blended(gathered.value[0], gathered.value[1], theta, blend), by_theta);
+  const BlendedAdjoint<V> by =
+      pull_back_blended(gathered.value[0], gathered.value[1], theta, blend, by_theta, by_blend);
+  store_scalar(at, entry(a.value, kHeatIncrement), by.increment);
+  store_scalar(at, entry(a.value, kHeatAverage), by.average);
+  store_scalar(at, a.theta, by.before);
+  if constexpr (Affine) {
+    const Vector<V, D> before = load_vector<D>(at, f.particles.gradient);
+    const auto &increment = gathered.moment[0], &average = gathered.moment[1];
+    Vector<V, D> after, adjoint = load_vector<D>(at, constant(a.gradient)), by_increment, by_average;
+    MPM_UNROLL for (int d = 0; d < D; d++)
+      after[d] = blended(increment[d], average[d], before[d], blend);
+    pull_back_transport(a, at, after, dt, adjoint);
+    MPM_UNROLL for (int d = 0; d < D; d++) {
+      const BlendedAdjoint<V> b = pull_back_blended(increment[d], average[d], before[d], blend, adjoint[d], by_blend);
+      by_increment[d] = b.increment, by_average[d] = b.average, adjoint[d] = b.before;
+    }
+    store_vector<D>(at, entry(a.moment, kHeatIncrement), V(T(f.moment_scale)) * by_increment);
+    store_vector<D>(at, entry(a.moment, kHeatAverage), V(T(f.moment_scale)) * by_average);
+    store_vector<D>(at, a.gradient, adjoint);
   }
-  adjoints.put(grad_theta);
-  adjoints.put(Affine ? load_vector<D>(at, constant(a.gradient)) : zero_vector<V, D>());
-  Update::pull_back(in, adjoint, [](int) { return true; }, [&](int n, const V& sum) { grad[n] = sum; });
-
-  Reader<V, D> read{grad};
-  MPM_UNROLL for (int k = kHeatIncrement; k <= kHeatAverage; k++)
-    store_scalar(at, entry(a.value, k), read.scalar());
-  MPM_UNROLL for (int k = kHeatIncrement; k <= kHeatAverage; k++) {
-    const Vector<V, D> moment = read.vector();
-    if (Affine) store_vector<D>(at, entry(a.moment, k), V(T(f.moment_scale)) * moment);
-  }
-  store_scalar(at, a.theta, read.scalar());
-  const Vector<V, D> gradient = read.vector();
-  if (Affine) store_vector<D>(at, a.gradient, gradient);
-  store_scalar(at, a.blend, read.scalar());
-  store_matrix<D>(Adding<At>(at), a.velocity_gradient, read.matrix());
-  add_scalar(at, a.dt, read.scalar());
+  store_scalar(at, a.blend, by_blend);
 }
 
 // At a node of a block of a scene: the solve adds λ · (source − exchange (θ + d)) to the adjoints.
@@ -361,74 +408,129 @@ MPM_HD typename At::Value pull_back_surface(const HeatToNodesBackwardArguments<T
   return by_volume;
 }
 
+// Adjoints of what P2G adds to the sums of the nodes: those of θ and its gradient are added, and the factors of the
+// forms stored; returns those of the heat capacity and of β.
+template <class At, class T, int D>
+MPM_HD HeatWeights<typename At::Value> pull_back_sums(
+    const HeatToNodesBackwardArguments<T, D>& a, const At& at, const HeatWeights<typename At::Value>& weights,
+    const HeatGathered<typename At::Value, D, kHeatChannels>& gathered) {
+  using V = typename At::Value;
+  const HeatToNodesArguments<T, D>& f = a.forward;
+  const bool affine = f.particles.gradient.pointer;
+  const Vector<V, D> slope = affine ? load_vector<D>(at, f.particles.gradient) : zero_vector<V, D>();
+  V in[3 + D], grad[3 + D];
+  Writer<V, D> arguments{in};
+  arguments.put(weights.capacity);
+  arguments.put(weights.blend);
+  arguments.put(load_scalar(at, f.particles.theta));
+  arguments.put(slope);
+  const HeatSums<V> sums = heat_sums(weights, in[2]);
+  store_scalar(at, entry(a.value, kHeatCapacity), sums.capacity);
+  store_scalar(at, entry(a.value, kHeatVarying), sums.varying);
+  store_scalar(at, entry(a.value, kHeatTheta), sums.theta);
+  store_scalar(at, entry(a.value, kHeatMean), sums.mean);
+  pull_back(in, grad, affine ? 3 + D : 3, [&](const Dual<V>(&x)[3 + D]) {
+    HeatWeights<Dual<V>> w{};
+    w.capacity = x[0];
+    w.blend = x[1];
+    const HeatSums<Dual<V>> value = heat_sums(w, x[2]);
+    V sum = gathered.value[kHeatCapacity] * value.capacity.derivative +
+            gathered.value[kHeatVarying] * value.varying.derivative +
+            gathered.value[kHeatTheta] * value.theta.derivative + gathered.value[kHeatMean] * value.mean.derivative;
+    MPM_UNROLL for (int d = 0; d < D; d++) {
+      const HeatSums<Dual<V>> moment = heat_sums(w, x[3 + d]);
+      sum = sum + gathered.moment[kHeatTheta][d] * moment.theta.derivative +
+            gathered.moment[kHeatMean][d] * moment.mean.derivative;
+    }
+    return sum;
+  });
+  add_scalar(at, a.theta, grad[2]);
+  if (affine) {
+    Vector<V, D> of_theta, of_mean, by_slope;
+    MPM_UNROLL for (int d = 0; d < D; d++) {
+      const HeatSums<V> moment = heat_sums(weights, slope[d]);
+      of_theta[d] = moment.theta, of_mean[d] = moment.mean, by_slope[d] = grad[3 + d];
+    }
+    store_vector<D>(at, entry(a.moment, kHeatTheta), of_theta);
+    store_vector<D>(at, entry(a.moment, kHeatMean), of_mean);
+    store_vector<D>(Adding<At>(at), a.gradient, by_slope);
+  }
+  HeatWeights<V> by{};
+  by.capacity = grad[0];
+  by.blend = grad[1];
+  return by;
+}
+
+// Adjoints of the rest volume, and of J or F, by the present volume.
+template <class At, class T, int D>
+MPM_HD void pull_back_volume(const HeatToNodesBackwardArguments<T, D>& a, const At& at,
+                             const typename At::Value& by_volume) {
+  using V = typename At::Value;
+  V in[1 + D * D], grad[1 + D * D];
+  Writer<V, D> arguments{in};
+  arguments.put(load_scalar(at, a.rest));
+  Matrix<V, D> by_F = zero_matrix<V, D>();
+  if (a.J.pointer) {
+    arguments.put(load_scalar(at, a.J));
+    pull_back(in, grad, 2, [&](const Dual<V>(&x)[1 + D* D]) { return by_volume * (x[0] * x[1]).derivative; });
+    store_scalar(at, a.J_term, grad[1]);
+  } else if (a.F.pointer) {
+    arguments.put(load_matrix<D>(at, a.F));
+    pull_back(in, grad, 1 + D * D, [&](const Dual<V>(&x)[1 + D* D]) {
+      Reader<Dual<V>, D> read{x + 1};
+      return by_volume * (x[0] * determinant(read.matrix())).derivative;
+    });
+    Reader<V, D> read{grad + 1};
+    by_F = read.matrix();
+  } else {
+    grad[0] = by_volume;
+  }
+  if (a.F_term.pointer) store_matrix<D>(at, a.F_term, by_F);
+  add_scalar(at, a.volume, grad[0]);
+}
+
 // At particles inside the grid, from the adjoints of the sums.
 template <class At, class T, int D>
 MPM_HD void heat_of_nodes_backward(const HeatToNodesBackwardArguments<T, D>& a, const At& at, int scene,
                                    const typename At::Value& dt,
                                    const HeatGathered<typename At::Value, D, kHeatChannels>& gathered) {
   using V = typename At::Value;
-  using Weights = Applied<HeatWeightsOfParticle, D>;
-  using Moments = Applied<HeatMoments<2>, D>;
+  constexpr int scalars = 5, inputs = scalars + D * D;
   const HeatToNodesArguments<T, D>& f = a.forward;
-  V in[Weights::kIn], weights[Weights::kOut];
+  const V volume = load_scalar(at, f.particles.volume), dx(f.topology.geometry.dx);
+  V in[inputs], grad[inputs];
   Writer<V, D> arguments{in};
-  arguments.put(load_scalar(at, a.rest));
-  arguments.put(a.J.pointer ? load_scalar(at, a.J) : V(1));
-  arguments.put(!a.J.pointer && a.F.pointer ? load_matrix<D>(at, a.F) : identity<V, D>());
+  arguments.put(volume);
   arguments.put(load_value(at, f.specific_heat, scene));
   arguments.put(load_value(at, f.conductivity, scene));
   arguments.put(load_scalar(at, f.mass));
   arguments.put(dt);
-  arguments.put(load_matrix<D>(at, f.velocity_gradient));
-  arguments.put(V(f.topology.geometry.dx));
-  Weights::evaluate(in, weights);
-  const V capacity = weights[1], blend = blend_of(f.transfer, weights[3]);
+  const Matrix<V, D> L = load_matrix<D>(at, f.velocity_gradient);
+  arguments.put(L);
+  HeatWeights<V> weights = heat_weights<V, D>(in[0], in[1], in[2], in[3], in[4], L, dx);
+  weights.blend = blend_of(f.transfer, weights.blend);
 
-  V sums[Moments::kIn], of_nodes[Moments::kOut], adjoint[Moments::kOut], grad[Moments::kIn];
-  Writer<V, D> of_sums{sums}, adjoints{adjoint};
-  of_sums.put(load_scalar(at, f.particles.theta));
-  of_sums.put(f.particles.gradient.pointer ? load_vector<D>(at, f.particles.gradient) : zero_vector<V, D>());
-  of_sums.put(capacity);
-  of_sums.put(blend);
-  Moments::evaluate(sums, of_nodes);
-  constexpr int order[] = {kHeatTheta, kHeatMean, kHeatCapacity, kHeatVarying};  // of the results of HeatMoments
-  MPM_UNROLL for (int k = 0; k < kHeatChannels; k++) {
-    store_scalar(at, entry(a.value, order[k]), of_nodes[k]);
-    adjoints.put(gathered.value[order[k]]);
-  }
-  Reader<V, D> of_slopes{of_nodes + kHeatChannels};
-  MPM_UNROLL for (int k = 0; k < kHeatChannels; k++) {
-    const Vector<V, D> moment = of_slopes.vector();  // zero in the capacities, which are not stored
-    const bool stored = f.particles.gradient.pointer && order[k] >= kHeatTheta;
-    if (stored) store_vector<D>(at, entry(a.moment, order[k]), moment);
-    adjoints.put(gathered.moment[order[k]]);
-  }
-  Moments::pull_back(sums, adjoint, [](int) { return true; }, [&](int n, const V& sum) { grad[n] = sum; });
-  Reader<V, D> by_sums{grad};
-  add_scalar(at, a.theta, by_sums.scalar());
-  const Vector<V, D> gradient = by_sums.vector();
-  if (a.gradient.pointer) store_vector<D>(Adding<At>(at), a.gradient, gradient);
-
-  const V by_capacity = by_sums.scalar(), by_blend = by_sums.scalar() + load_scalar(at, a.blend);
+  HeatWeights<V> by = pull_back_sums(a, at, weights, gathered);
+  by.blend = by.blend + load_scalar(at, a.blend);
   const V by_rest = pull_back_conduction(a, at, load_scalar(at, constant(f.conductance)));
-  const V by_conductance = a.conductance.pointer ? load_scalar(at, a.conductance) : by_rest;
-  const V by_volume = a.surface_value.pointer ? pull_back_surface(a, at, scene, weights[0], dt) : V(0);
-  if (a.rate.pointer) add_scalar(at, a.dt, capacity * load_scalar(at, a.rate));
-  const V of_weights[] = {by_volume, by_capacity, by_conductance, f.transfer == HeatTransfer::hybrid ? by_blend : V(0),
-                          V(0)};
-  V by[Weights::kIn];
-  Weights::pull_back(in, of_weights, [](int n) { return n < Weights::kIn - 1; }, [&](int n, const V& v) { by[n] = v; });
-  Reader<V, D> read{by};
-  add_scalar(at, a.volume, read.scalar());
-  const V J = read.scalar();
-  if (a.J_term.pointer) store_scalar(at, a.J_term, J);
-  const Matrix<V, D> F = read.matrix();
-  if (a.F_term.pointer) store_matrix<D>(at, a.F_term, a.J.pointer ? zero_matrix<V, D>() : F);
-  add_parameter(at, a.parameters, kSpecificHeat, read.scalar());
-  add_parameter(at, a.parameters, kConductivity, read.scalar());
-  add_scalar(at, a.mass, read.scalar());
-  add_scalar(at, a.dt, read.scalar());
-  store_matrix<D>(Adding<At>(at), a.velocity_gradient, read.matrix());
+  by.conductance = a.conductance.pointer ? load_scalar(at, a.conductance) : by_rest;
+  const V by_volume = a.surface_value.pointer ? pull_back_surface(a, at, scene, volume, dt) : V(0);
+  if (a.rate.pointer) add_scalar(at, a.dt, weights.capacity * load_scalar(at, a.rate));
+  const bool varies = f.transfer == HeatTransfer::hybrid;  // else β is constant
+  pull_back(in, grad, varies ? inputs : scalars, [&](const Dual<V>(&x)[inputs]) {
+    Reader<Dual<V>, D> read{x + scalars};
+    const HeatWeights<Dual<V>> w =
+        heat_weights<Dual<V>, D>(x[0], x[1], x[2], x[3], x[4], read.matrix(), Dual<V>(dx, V(0)));
+    const V sum = by.capacity * w.capacity.derivative + by.conductance * w.conductance.derivative;
+    return varies ? sum + by.blend * w.blend.derivative : sum;
+  });
+  pull_back_volume(a, at, by_volume + grad[0]);
+  add_parameter(at, a.parameters, kSpecificHeat, grad[1]);
+  add_parameter(at, a.parameters, kConductivity, grad[2]);
+  add_scalar(at, a.mass, grad[3]);
+  add_scalar(at, a.dt, grad[4]);
+  Reader<V, D> read{grad + scalars};
+  if (varies) store_matrix<D>(Adding<At>(at), a.velocity_gradient, read.matrix());
 }
 
 // A particle outside the grid takes no part.

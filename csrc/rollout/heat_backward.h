@@ -151,7 +151,6 @@ void HeatBackward<T, D>::solve(HeatArguments<T, D> system, const Tensor& status)
   system.source = rows(source_);
   system.tolerance = 0;
   system.relative_tolerance = in_.heat_scalars[3];
-  system.scene_bound = nullptr;
   system.increment = rows(multiplier_);
   system.iterations = static_cast<int*>(iterations_.data_ptr());
   system.residual = rows(residual_);

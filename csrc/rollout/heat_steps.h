@@ -61,10 +61,10 @@ class HeatSteps {
     count(scene, stream);
   }
 
-  // The part of a substep up to the node temperatures.
+  // The part of a substep up to the node temperatures, with the increments of an earlier solve where they are known.
   HeatSolution<T, D> conduct(const Field<const T>& x, const Field<const T>& mass, const Field<const T>& rest,
                              const Field<const T>& velocity_gradient, const Field<const int>& scene,
-                             backend::Stream stream) {
+                             backend::Stream stream, const T* known = nullptr) {
     make_nodes(stream);
     HeatToNodesArguments<T, D> down = to_nodes(x, mass, velocity_gradient);
     backend::heat_to_nodes(in_.lattice.order(), down, stream);
@@ -72,7 +72,7 @@ class HeatSteps {
     if (holds_surface()) add_layers(x, scene, stream);
     means(stream);
     if (has_terms()) add_terms(x, rest, stream);
-    return {down, solve(x, scene, stream), static_cast<const T*>(theta_.data_ptr())};
+    return {down, solve(x, scene, known, stream), static_cast<const T*>(theta_.data_ptr())};
   }
 
   // The transfer of these temperatures to the particles.
@@ -88,6 +88,7 @@ class HeatSteps {
   // The columns of a tensor in the order of the fields.
   static Field<T> column_of(const Tensor& t, int first) { return column(field<T>(t), first); }
   int gradient_column() const { return gradient_; }
+  const Tensor& increments() const { return increment_; }  // of the latest solve [N]
   // The energy that laws have dissipated in a step, before its `run` [P, 1].
   Tensor dissipated_energy() const {
     Tensor all = fields.tensor();
@@ -138,7 +139,8 @@ class HeatSteps {
   void make_nodes(backend::Stream stream);
   HeatToNodesArguments<T, D> to_nodes(const Field<const T>& x, const Field<const T>& mass,
                                       const Field<const T>& velocity_gradient) const;
-  HeatArguments<T, D> solve(const Field<const T>& x, const Field<const int>& scene, backend::Stream stream);
+  HeatArguments<T, D> solve(const Field<const T>& x, const Field<const int>& scene, const T* known,
+                            backend::Stream stream);
   void find_largest(const Field<const T>& of, const Field<const int>& scene, double* to, int64_t stride,
                     backend::Stream stream) const;
   void count(const Field<const int>& scene, backend::Stream stream);
@@ -457,7 +459,7 @@ void HeatSteps<T, D>::add_terms(const Field<const T>& x, const Field<const T>& r
 }
 
 template <class T, int D>
-HeatArguments<T, D> HeatSteps<T, D>::solve(const Field<const T>& x, const Field<const int>& scene,
+HeatArguments<T, D> HeatSteps<T, D>::solve(const Field<const T>& x, const Field<const int>& scene, const T* known,
                                            backend::Stream stream) {
   const int64_t nodes = slots_ * kBlockNodes<D>;
   T* const sums = static_cast<T*>(sums_.data_ptr());
@@ -489,8 +491,9 @@ HeatArguments<T, D> HeatSteps<T, D>::solve(const Field<const T>& x, const Field<
   a.converged = static_cast<bool*>(converged_.data_ptr());
   if (!workspace_.defined()) workspace_ = empty(in_.x, {backend::heat_workspace(a, stream)}, ScalarType::Byte);
   a.workspace = workspace_.data_ptr();
-  backend::heat_cg(in_.lattice.order(), a, stream);
-  backend::heat_increments(HeatIncrementsArguments<T, D>{nodes, a.increment, a.theta, theta, sums}, stream);
+  if (!known) backend::heat_cg(in_.lattice.order(), a, stream);
+  const T* const increment = known ? known : a.increment;
+  backend::heat_increments(HeatIncrementsArguments<T, D>{nodes, increment, a.theta, theta, sums}, stream);
   return a;
 }
 

@@ -112,7 +112,10 @@ class Recorded {
       Tensor energy = heat->dissipated_energy();
       torch::stable::copy_(energy, dissipated.vector(i));
     }
-    return heat->conduct(state(i).x, steps.p2g.mass, steps.p2g.volume, constant(C[i]), scene_of_particles(), stream_);
+    const T* const known =
+        keeps_grids_ ? static_cast<const T*>(torch::stable::select(increments_, 0, i).data_ptr()) : nullptr;
+    return heat->conduct(state(i).x, steps.p2g.mass, steps.p2g.volume, constant(C[i]), scene_of_particles(), stream_,
+                         known);
   }
 
   // The whole record in one tensor; undefined if a pool has outgrown it.
@@ -190,6 +193,9 @@ class Recorded {
     heat->run(state(i).x, steps.p2g.mass, steps.p2g.volume, constant(C[i]), scene_of_particles(), stream_);
     Tensor to = heat_after.vector(i);
     torch::stable::copy_(to, heat->state());
+    if (!keeps_grids_) return;
+    Tensor increments = torch::stable::select(increments_, 0, i);
+    torch::stable::copy_(increments, heat->increments());
   }
 
   bool activate(int64_t i) { return steps.activate(i == 0 && !goes_on_ ? nullptr : status(i - 1), status(i), stream_); }
@@ -229,7 +235,7 @@ class Recorded {
   bool keeps_grids_ = false, taken_ = false;
   Arena grids_;  // begins at the first step
   int64_t grid_size_ = 0;
-  Tensor nodes_;  // of all grids
+  Tensor nodes_, increments_;  // of all grids; the latter of heat
   int* status_ = nullptr;
 };
 
@@ -256,6 +262,7 @@ Recorded<T, D>::Recorded(const SubstepsInputs& in, const OptionalTensor& memory,
   grid_in(one, {});
   grid_size_ = one.size();
   one.template tensor<T>(in.x, Pool<T, D>::nodes_shape(steps.activation), in.x.scalar_type());
+  if (heat) one.template tensor<T>(in.x, {int64_t(steps.activation.slots()) * kBlockNodes<D>}, in.x.scalar_type());
   // At most half of the memory of the particles; torch_mpm/rollouts/budget.py relies on it.
   keeps_grids_ = 2 * one.size() <= in.x.size(0) * (2 * D + 4 * D * D) * int64_t(sizeof(T));
   lay_out(counted);
@@ -303,6 +310,7 @@ void Recorded<T, D>::lay_out(Arena& arena) {
   if (!keeps_grids_) return;
   const Shape nodes = Pool<T, D>::nodes_shape(steps.activation);
   nodes_ = arena.tensor<T>(given, {n, nodes[0], nodes[1]}, given.scalar_type());
+  if (heat) increments_ = arena.tensor<T>(given, {n, nodes[0]}, given.scalar_type());
   grids_ = arena;
   arena.skip(n * grid_size_);
 }
