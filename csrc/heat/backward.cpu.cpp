@@ -14,7 +14,10 @@ struct AtGroup {
 
   MPM_HD Value load(const T* pointer, int64_t stride) const { return load_row(pointer, stride, g); }
   MPM_HD void store(T* pointer, int64_t stride, const Value& value) const {
-    store_row_exactly(value, pointer, stride, g);
+    if (g.consecutive && g.count < kLanes)
+      store_row_exactly(value, pointer, stride, g);
+    else
+      store_row(value, pointer, stride, g);
   }
 };
 
