@@ -242,7 +242,7 @@ class _Calls:
             ("substeps", call),
             ("substeps", with_heat),
             ("substeps_backward", ([*grads, torch.ones_like(impulse), None], 15, None, *call)),
-            ("substeps_backward", ([*grads, None, of_heat], 111, None, *with_adjoint)),
+            ("substeps_backward", ([*grads, None, of_heat], 239, None, *with_adjoint)),
             ("law_figures", figures),
             ("plan_substeps", (-1, *facts)),
             ("latest_schedule", (self.x,)),

@@ -70,16 +70,24 @@ void from_nodes(const HeatToNodesBackwardArguments<T, D>& a) {
                        });
 }
 
-// visit(scene, node) for the nodes of the blocks of the scenes.
+// visit(scene, corner, slot) for the blocks of the scenes, and visit(scene, node) for their nodes.
 template <class T, int D, class F>
-void for_nodes(const Topology<T, D>& t, const F& visit) {
+void for_blocks(const Topology<T, D>& t, const F& visit) {
   constexpr int64_t grain = 64;  // slots below which a range is not split
   parallel_ranges(t.max_blocks, grain, [&](int64_t begin, int64_t end) {
     for (int64_t slot = begin; slot < end; slot++) {
-      const int block = t.block[slot], scene = block / t.geometry.blocks_per_scene;
-      if (block < 0 || scene >= t.scenes) continue;
-      for (int64_t i = slot * kBlockNodes<D>; i < (slot + 1) * kBlockNodes<D>; i++) visit(scene, i);
+      const int block = t.block[slot];
+      if (block < 0 || block / t.geometry.blocks_per_scene >= t.scenes) continue;
+      const BaseBlock<T, D> base(t, int(slot));
+      visit(base.scene, base.corner, slot);
     }
+  });
+}
+
+template <class T, int D, class F>
+void for_nodes(const Topology<T, D>& t, const F& visit) {
+  for_blocks(t, [&](int scene, const int (&)[D], int64_t slot) {
+    for (int64_t i = slot * kBlockNodes<D>; i < (slot + 1) * kBlockNodes<D>; i++) visit(scene, i);
   });
 }
 
@@ -93,6 +101,26 @@ void heat_to_particles_backward(const HeatToParticlesBackwardArguments<T, D>& a)
 template <class T, int D>
 void heat_term_backward(const HeatTermBackwardArguments<T, D>& a) {
   for_nodes(a.forward.topology, [&](int scene, int64_t i) { heat_of_term_backward(a, scene, i); });
+}
+
+template <class T, int D>
+void heat_numbers_backward(const HeatNumbersBackwardArguments<T, D>& a) {
+  for_blocks(a.term.forward.topology,
+             [&](int scene, const int (&corner)[D], int64_t slot) { heat_numbers_of_slot(a, scene, corner, slot); });
+}
+
+template <class T, int D>
+void heat_held_backward(const HeatHeldBackwardArguments<T, D>& a) {
+  for_blocks(a.hold.topology, [&](int scene, const int (&corner)[D], int64_t slot) {
+    held_temperature_of_slot(a, scene, corner, slot);
+  });
+}
+
+template <class T, int D>
+void heat_surface_temperature_backward(const HeatSurfaceTemperatureBackwardArguments<T, D>& a) {
+  for_blocks(a.topology, [&](int scene, const int (&corner)[D], int64_t slot) {
+    surface_temperature_of_slot(a, scene, corner, slot);
+  });
 }
 
 template <class T, int D>
@@ -116,6 +144,9 @@ void heat_to_nodes_backward(const HeatToNodesBackwardArguments<T, D>& a) {
 
 MPM_INSTANTIATE_ORDERS(heat_to_particles_backward, HeatToParticlesBackwardArguments)
 MPM_INSTANTIATE(heat_term_backward, HeatTermBackwardArguments)
+MPM_INSTANTIATE(heat_numbers_backward, HeatNumbersBackwardArguments)
+MPM_INSTANTIATE(heat_held_backward, HeatHeldBackwardArguments)
+MPM_INSTANTIATE(heat_surface_temperature_backward, HeatSurfaceTemperatureBackwardArguments)
 MPM_INSTANTIATE(heat_nodes_backward, HeatNodesBackwardArguments)
 MPM_INSTANTIATE(heat_layers_backward, HeatLayersBackwardArguments)
 MPM_INSTANTIATE_ORDERS(heat_to_nodes_backward, HeatToNodesBackwardArguments)

@@ -97,6 +97,33 @@ MPM_HD void node_backward(const HeatNodesBackwardArguments<T, D>& a, int64_t i) 
   at_node<heat_of_node_backward<T, D>>(a.topology, a, i);
 }
 
+// Calls work(a, scene, corner, slot) for the block of a slot.
+template <auto work, class T, int D, class Arguments>
+MPM_HD void at_slot(const Topology<T, D>& t, const Arguments& a, int64_t slot) {
+  const int block = t.block[slot];
+  if (block < 0) return;
+  int corner[D];
+  const int scene = block_coordinates(t.geometry, block, corner);
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    corner[i] *= kBlockWidth;
+  if (scene < t.scenes) work(a, scene, corner, slot);
+}
+
+template <class T, int D>
+MPM_HD void numbers_backward(const HeatNumbersBackwardArguments<T, D>& a, int64_t slot) {
+  at_slot<heat_numbers_of_slot<T, D>>(a.term.forward.topology, a, slot);
+}
+
+template <class T, int D>
+MPM_HD void held_backward(const HeatHeldBackwardArguments<T, D>& a, int64_t slot) {
+  at_slot<held_temperature_of_slot<T, D>>(a.hold.topology, a, slot);
+}
+
+template <class T, int D>
+MPM_HD void surface_temperature_backward(const HeatSurfaceTemperatureBackwardArguments<T, D>& a, int64_t slot) {
+  at_slot<surface_temperature_of_slot<T, D>>(a.topology, a, slot);
+}
+
 template <class T, int D>
 int64_t nodes_of(const Topology<T, D>& t) {
   return int64_t(t.max_blocks) * kBlockNodes<D>;
@@ -115,6 +142,21 @@ void heat_to_particles_backward(const HeatToParticlesBackwardArguments<T, D>& a,
 template <class T, int D>
 void heat_term_backward(const HeatTermBackwardArguments<T, D>& a, Stream stream) {
   for_each<term_backward<T, D>>(nodes_of(a.forward.topology), a, stream);
+}
+
+template <class T, int D>
+void heat_numbers_backward(const HeatNumbersBackwardArguments<T, D>& a, Stream stream) {
+  for_each<numbers_backward<T, D>>(a.term.forward.topology.max_blocks, a, stream);
+}
+
+template <class T, int D>
+void heat_held_backward(const HeatHeldBackwardArguments<T, D>& a, Stream stream) {
+  for_each<held_backward<T, D>>(a.hold.topology.max_blocks, a, stream);
+}
+
+template <class T, int D>
+void heat_surface_temperature_backward(const HeatSurfaceTemperatureBackwardArguments<T, D>& a, Stream stream) {
+  for_each<surface_temperature_backward<T, D>>(a.topology.max_blocks, a, stream);
 }
 
 template <class T, int D>
@@ -137,6 +179,9 @@ void heat_to_nodes_backward(const HeatToNodesBackwardArguments<T, D>& a, Stream 
 
 MPM_INSTANTIATE_ORDERS(heat_to_particles_backward, HeatToParticlesBackwardArguments)
 MPM_INSTANTIATE(heat_term_backward, HeatTermBackwardArguments)
+MPM_INSTANTIATE(heat_numbers_backward, HeatNumbersBackwardArguments)
+MPM_INSTANTIATE(heat_held_backward, HeatHeldBackwardArguments)
+MPM_INSTANTIATE(heat_surface_temperature_backward, HeatSurfaceTemperatureBackwardArguments)
 MPM_INSTANTIATE(heat_nodes_backward, HeatNodesBackwardArguments)
 MPM_INSTANTIATE(heat_layers_backward, HeatLayersBackwardArguments)
 MPM_INSTANTIATE_ORDERS(heat_to_nodes_backward, HeatToNodesBackwardArguments)

@@ -13,7 +13,7 @@ namespace mpm {
 enum HeatForm : int { kHeatIncrement = kHeatChannels, kHeatAverage, kHeatAfter, kHeatMultiplier, kHeatForms };
 
 // Columns of the adjoints of the parameters.
-enum HeatParameter : int { kConductivity, kSpecificHeat, kMeltingPoint, kLatentHeat, kHeatParameters };
+enum HeatParameter : int { kConductivity, kSpecificHeat, kMeltingPoint, kLatentHeat, kPower, kHeatParameters };
 
 // Adjoint of G2P: from the adjoints of the temperature, its gradient and the liquid fraction to those of the nodes.
 template <class T, int D>
@@ -34,6 +34,37 @@ struct HeatTermBackwardArguments {
   const T* multiplier = nullptr;    // λ, see HeatNodesBackwardArguments
   T* surface = nullptr;             // [N, kHeatChannels], added
   T* theta = nullptr;               // [N], added
+};
+
+// Adjoints of the numbers of the boundary, summed over the nodes of each slot: of both numbers of a term, of the
+// temperature of the nodes that an obstacle holds, or of that of the held surface.
+template <class T>
+struct HeatSlotSums {
+  T* sums = nullptr;  // [max_blocks, columns]
+  int columns = 0, first = 0;
+};
+
+template <class T, int D>
+struct HeatNumbersBackwardArguments {
+  HeatTermBackwardArguments<T, D> term;  // its results are unused
+  HeatSlotSums<T> to;
+};
+
+template <class T, int D>
+struct HeatHeldBackwardArguments {
+  HeatHoldArguments<T, D> hold;  // its temperatures are unused
+  const T* adjoints = nullptr;   // as those of HeatNodesBackwardArguments
+  const T* product = nullptr;
+  bool* counted = nullptr;  // [N], nodes of an obstacle that came before, and of this one
+  HeatSlotSums<T> to;
+};
+
+template <class T, int D>
+struct HeatSurfaceTemperatureBackwardArguments {
+  Topology<T, D> topology;
+  const T* multiplier = nullptr;
+  const T* exchange = nullptr;  // of the layer alone [N]
+  HeatSlotSums<T> to;
 };
 
 // Adjoint of the solve and of the averages, with the solution λ of A λ = adjoint of the increment.
@@ -241,33 +272,85 @@ MPM_HD void heat_of_particles_backward(const HeatToParticlesBackwardArguments<T,
   store_scalar(at, a.blend, by_blend);
 }
 
-// At a node of a block of a scene: the solve adds λ · (source − exchange (θ + d)) to the adjoints.
+// A term at a node of a block of a scene: the solve adds λ · (power − coefficient (θ + d)) to the adjoints.
 template <class T, int D>
-MPM_HD void heat_of_term_backward(const HeatTermBackwardArguments<T, D>& a, int scene, int64_t i) {
-  const HeatTermArguments<T, D>& f = a.forward;
-  const T multiplier = a.multiplier[i];
-  if (f.term == HeatTerm::power) {
-    a.surface[i * kHeatChannels] += multiplier;
-    return;
-  }
-  const T after = f.theta[i] + a.sums[i * kHeatChannels + kHeatTheta];
-  const T* const number = f.number + 2 * int64_t(scene);
-  const auto lifted = [](const T& value) { return Dual<T>{value, T(0)}; };
-  const Vector<T, D> at_node = normal_of_node(f, i);
+struct DualTerm {
+  const HeatTermBackwardArguments<T, D>& a;
   Vector<Dual<T>, D> normal;
-  MPM_UNROLL for (int d = 0; d < D; d++)
-    normal[d] = lifted(at_node[d]);
-  Dual<T> theta = lifted(f.theta[i]);
-  const auto by = [&](Dual<T>& input) {
+  Dual<T> theta, first, second, reference;
+  T multiplier, after;
+
+  MPM_HD DualTerm(const HeatTermBackwardArguments<T, D>& arguments, int scene, int64_t i) : a(arguments) {
+    const HeatTermArguments<T, D>& f = a.forward;
+    const auto lifted = [](const T& value) { return Dual<T>{value, T(0)}; };
+    const Vector<T, D> at_node = normal_of_node(f, i);
+    MPM_UNROLL for (int d = 0; d < D; d++)
+      normal[d] = lifted(at_node[d]);
+    theta = lifted(f.theta[i]);
+    first = lifted(f.number[2 * int64_t(scene)]);
+    second = lifted(f.number[2 * int64_t(scene) + 1]);
+    reference = lifted(T(f.reference));
+    multiplier = a.multiplier[i];
+    after = f.theta[i] + a.sums[i * kHeatChannels + kHeatTheta];
+  }
+
+  // By one of the inputs.
+  MPM_HD T by(Dual<T>& input) const {
     input.derivative = T(1);
-    const HeatRadiationAt<Dual<T>> linear =
-        heat_of_term(f.term, normal, theta, lifted(number[0]), lifted(number[1]), lifted(T(f.reference)));
+    const HeatRadiationAt<Dual<T>> linear = heat_of_term(a.forward.term, normal, theta, first, second, reference);
     input.derivative = T(0);
     return multiplier * (linear.power.derivative - after * linear.coefficient.derivative);
-  };
+  }
+};
+
+template <class T, int D>
+MPM_HD void heat_of_term_backward(const HeatTermBackwardArguments<T, D>& a, int scene, int64_t i) {
+  T* const surface = a.surface + i * kHeatChannels;
+  if (a.forward.term == HeatTerm::power) {
+    surface[0] += a.multiplier[i];
+    return;
+  }
+  DualTerm<T, D> term(a, scene, i);
   MPM_UNROLL for (int d = 0; d < D; d++)
-    a.surface[i * kHeatChannels + 1 + d] += by(normal[d]);
-  a.theta[i] += by(theta);
+    surface[1 + d] += term.by(term.normal[d]);
+  a.theta[i] += term.by(term.theta);
+}
+
+template <class T, int D>
+MPM_HD void heat_numbers_of_slot(const HeatNumbersBackwardArguments<T, D>& a, int scene, const int (&)[D],
+                                 int64_t slot) {
+  T first(0), second(0);
+  for (int64_t i = slot * kBlockNodes<D>; i < (slot + 1) * kBlockNodes<D>; i++) {
+    DualTerm<T, D> term(a.term, scene, i);
+    first += term.by(term.first);
+    second += term.by(term.second);
+  }
+  T* const to = a.to.sums + slot * a.to.columns + a.to.first;
+  to[0] = first;
+  to[1] = second;
+}
+
+// Increments lead from the averages to the held temperature, from which heat flows to the other nodes.
+template <class T, int D>
+MPM_HD void held_temperature_of_slot(const HeatHeldBackwardArguments<T, D>& a, int scene, const int (&corner)[D],
+                                     int64_t slot) {
+  const ObstaclePose<T, D> pose = pose_of(a.hold.contact, a.hold.obstacle, scene);
+  T sum(0);
+  for (int local = 0; pose.acts && local < kBlockNodes<D>; local++) {
+    const int64_t i = slot * kBlockNodes<D> + local;
+    if (!a.hold.fixed[i] || a.counted[i] || !is_held(a.hold, pose, corner, local)) continue;
+    a.counted[i] = true;
+    sum += a.adjoints[2 * i] - a.product[i];
+  }
+  a.to.sums[slot * a.to.columns + a.to.first] = sum;
+}
+
+template <class T, int D>
+MPM_HD void surface_temperature_of_slot(const HeatSurfaceTemperatureBackwardArguments<T, D>& a, int, const int (&)[D],
+                                        int64_t slot) {
+  T sum(0);
+  for (int64_t i = slot * kBlockNodes<D>; i < (slot + 1) * kBlockNodes<D>; i++) sum += a.multiplier[i] * a.exchange[i];
+  a.to.sums[slot * a.to.columns + a.to.first] = sum;
 }
 
 // At a node of a block of a scene.
@@ -391,6 +474,7 @@ MPM_HD typename At::Value pull_back_surface(const HeatToNodesBackwardArguments<T
     const V density = load_value(at, f.power, scene);
     by_volume = by_volume + density * by_power;
     power = density * volume;
+    add_parameter(at, a.parameters, kPower, volume * by_power);
   }
   if (f.dissipated.pointer) {
     const V in[] = {V(T(f.share)) * load_scalar(at, f.dissipated), load_scalar(at, f.rest), dt}, adjoint[] = {by_power};

@@ -30,10 +30,13 @@ MPM_BACKEND_KERNELS(MPM_HEAT_KERNELS)
   ORDERED(heat_to_particles, HeatToParticlesArguments)
 MPM_BACKEND_KERNELS(MPM_HEAT_TRANSFER_KERNELS)
 
-#define MPM_HEAT_BACKWARD_KERNELS(PLAIN, ORDERED, SIZE)                 \
-  ORDERED(heat_to_particles_backward, HeatToParticlesBackwardArguments) \
-  PLAIN(heat_term_backward, HeatTermBackwardArguments)                  \
-  PLAIN(heat_nodes_backward, HeatNodesBackwardArguments)                \
-  PLAIN(heat_layers_backward, HeatLayersBackwardArguments)              \
+#define MPM_HEAT_BACKWARD_KERNELS(PLAIN, ORDERED, SIZE)                             \
+  ORDERED(heat_to_particles_backward, HeatToParticlesBackwardArguments)             \
+  PLAIN(heat_term_backward, HeatTermBackwardArguments)                              \
+  PLAIN(heat_numbers_backward, HeatNumbersBackwardArguments)                        \
+  PLAIN(heat_held_backward, HeatHeldBackwardArguments)                              \
+  PLAIN(heat_surface_temperature_backward, HeatSurfaceTemperatureBackwardArguments) \
+  PLAIN(heat_nodes_backward, HeatNodesBackwardArguments)                            \
+  PLAIN(heat_layers_backward, HeatLayersBackwardArguments)                          \
   ORDERED(heat_to_nodes_backward, HeatToNodesBackwardArguments)
 MPM_BACKEND_KERNELS(MPM_HEAT_BACKWARD_KERNELS)

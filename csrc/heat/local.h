@@ -97,11 +97,17 @@ MPM_HD void heat_increment(const HeatIncrementsArguments<T, D>& a, int64_t i) {
   a.sums[i * kHeatChannels + kHeatTheta] = a.increment[i] + (a.start[i] - a.theta[i]);
 }
 
+// Whether an obstacle that acts contains a node of a block.
+template <class T, int D>
+MPM_HD bool is_held(const HeatHoldArguments<T, D>& a, const ObstaclePose<T, D>& pose, const int (&corner)[D],
+                    int local) {
+  return distance_from(pose, node_position(a.contact, corner, local)) <= a.contact.rounding;
+}
+
 template <class T, int D>
 MPM_HD void hold_node(const HeatHoldArguments<T, D>& a, const ObstaclePose<T, D>& pose, int scene,
                       const int (&corner)[D], int local, int64_t i) {
-  if (a.fixed[i] || !(a.capacity[i] > T(0))) return;
-  if (!(distance_from(pose, node_position(a.contact, corner, local)) <= a.contact.rounding)) return;
+  if (a.fixed[i] || !(a.capacity[i] > T(0)) || !is_held(a, pose, corner, local)) return;
   a.fixed[i] = true;
   a.theta[i] = a.temperature[scene * a.stride];
 }

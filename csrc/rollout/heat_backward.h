@@ -12,7 +12,8 @@ struct HeatAdjoints {
   Tensor state;       // [P, m] in the order of the record
   Tensor parameters;  // [P, kHeatParameters]
   Tensor velocity_gradient, mass, volume, dt;
-  Tensor status;  // [B, kHeatStatusSize] of the adjoint solves, as that of the solves of a call
+  Tensor boundaries;  // [B, m]: of both numbers of each term, and of the temperatures of the held obstacles
+  Tensor status;      // [B, kHeatStatusSize] of the adjoint solves, as that of the solves of a call
 };
 
 template <class T, int D>
@@ -32,6 +33,7 @@ class HeatBackward {
     scatter(up);
     solve(solution.system, adjoints.status);
     if (heat().has_terms()) adjoint_of_terms(solution);
+    if (adjoints.boundaries.defined()) adjoint_of_boundaries(solution, adjoints.boundaries);
     adjoint_of_nodes(solution, adjoints.dt.defined());
     gather(solution.down, adjoints.dt.defined());
     if (heat().holds_surface()) adjoint_of_layers(solution.down);
@@ -54,7 +56,11 @@ class HeatBackward {
   HeatToParticlesBackwardArguments<T, D> to_particles(const HeatSolution<T, D>& solution, const HeatAdjoints& adjoints);
   void scatter(const HeatToParticlesBackwardArguments<T, D>& up);
   void solve(HeatArguments<T, D> system, const Tensor& status);
+  HeatTermBackwardArguments<T, D> term_backward(const HeatSolution<T, D>& solution,
+                                                const HeatTermArguments<T, D>& term) const;
   void adjoint_of_terms(const HeatSolution<T, D>& solution);
+  void adjoint_of_boundaries(const HeatSolution<T, D>& solution, const Tensor& sums);
+  void adjoint_of_surface_temperature(const HeatSolution<T, D>& solution, const HeatSlotSums<T>& to);
   void adjoint_of_layers(const HeatToNodesArguments<T, D>& down);
   void adjoint_of_nodes(const HeatSolution<T, D>& solution, bool by_dt);
   void gather(const HeatToNodesArguments<T, D>& down, bool by_dt);
@@ -68,10 +74,11 @@ class HeatBackward {
   Tensor value_, moment_, blend_, rate_of_particles_;  // [P, kHeatForms], [P, kHeatForms, D], [P], [P, 1]
   int64_t nodes_ = -1;
   Tensor adjoints_, source_, multiplier_, product_, forms_, rate_;  // of the nodes
+  Tensor slot_sums_, counted_;  // of the numbers of the boundary, by slots; nodes that are held
   // Adjoints of the sums of the free surface, and of θ by the terms; [P, 1 + D], [P, 1 + D, D].
   Tensor surface_, by_terms_, surface_value_, surface_gradient_;
   // Of a held surface: adjoint of the exchange of the nodes, and gathered [P, 1]; of κ V [P], and of x [P, D].
-  Tensor layer_, layer_of_particles_, by_conductance_, x_layer_;
+  Tensor layer_, layer_exchange_, layer_of_particles_, by_conductance_, x_layer_;
   Tensor iterations_, residual_, converged_, workspace_, operator_workspace_;
 };
 
@@ -177,18 +184,61 @@ void HeatBackward<T, D>::solve(HeatArguments<T, D> system, const Tensor& status)
 }
 
 template <class T, int D>
+HeatTermBackwardArguments<T, D> HeatBackward<T, D>::term_backward(const HeatSolution<T, D>& solution,
+                                                                  const HeatTermArguments<T, D>& term) const {
+  return {term, solution.down.sums.pointer, rows(multiplier_), rows(surface_), rows(by_terms_)};
+}
+
+template <class T, int D>
 void HeatBackward<T, D>::adjoint_of_terms(const HeatSolution<T, D>& solution) {
   backend::clear(surface_, stream_);
   backend::clear(by_terms_, stream_);
-  HeatTermBackwardArguments<T, D> a;
-  a.sums = solution.down.sums.pointer;
-  a.multiplier = rows(multiplier_);
-  a.surface = rows(surface_);
-  a.theta = rows(by_terms_);
-  for (const HeatTermArguments<T, D>& term : heat().terms()) {
-    a.forward = term;
-    backend::heat_term_backward(a, stream_);
+  for (const HeatTermArguments<T, D>& term : heat().terms())
+    backend::heat_term_backward(term_backward(solution, term), stream_);
+}
+
+// Adds the adjoints of the numbers of the boundary to their sums.
+template <class T, int D>
+void HeatBackward<T, D>::adjoint_of_boundaries(const HeatSolution<T, D>& solution, const Tensor& sums) {
+  const Topology<T, D>& t = solution.system.topology;
+  const int columns = int(sums.size(1));
+  slot_sums_ = empty(in_.x, {int64_t(t.max_blocks), columns});
+  backend::clear(slot_sums_, stream_);
+  HeatSlotSums<T> to{rows(slot_sums_), columns, 0};
+  if (heat().has_terms())
+    for (const HeatTermArguments<T, D>& term : heat().terms()) {
+      if (term.term == HeatTerm::power) continue;
+      backend::heat_numbers_backward(HeatNumbersBackwardArguments<T, D>{term_backward(solution, term), to}, stream_);
+      to.first += 2;
+    }
+  if (heat().held_nodes() > 0) {
+    counted_ = empty(in_.x, {nodes_}, ScalarType::Bool);
+    backend::clear(counted_, stream_);
   }
+  for (int64_t k = 0; k < heat().held_nodes(); k++, to.first++)
+    backend::heat_held_backward(
+        HeatHeldBackwardArguments<T, D>{heat().hold(k, solution.system.heat_capacity), rows(adjoints_), rows(product_),
+                                        static_cast<bool*>(counted_.data_ptr()), to},
+        stream_);
+  if (heat().holds_surface()) adjoint_of_surface_temperature(solution, to);
+  backend::sum_slots(SumSlotsArguments<T, D>{{t.max_blocks, t.geometry.blocks_per_scene, t.block, int(in_.scenes),
+                                              columns, in_.scenes > 1, rows(slot_sums_), rows(sums), columns}},
+                     stream_);
+}
+
+template <class T, int D>
+void HeatBackward<T, D>::adjoint_of_surface_temperature(const HeatSolution<T, D>& solution, const HeatSlotSums<T>& to) {
+  layer_exchange_ = empty(in_.x, {nodes_});
+  backend::clear(layer_exchange_, stream_);
+  ScatterArguments<T, D> a;
+  a.topology = solution.down.topology;
+  a.x = solution.down.x;
+  a.value = field<const T>(heat().exchange_of_particles());
+  a.deterministic = in_.lattice.deterministic();
+  a.nodes = {rows(layer_exchange_), 1, 1};
+  backend::scatter(order(), a, stream_);
+  backend::heat_surface_temperature_backward(
+      HeatSurfaceTemperatureBackwardArguments<T, D>{a.topology, rows(multiplier_), rows(layer_exchange_), to}, stream_);
 }
 
 template <class T, int D>

@@ -102,13 +102,14 @@ class HeatSteps {
 
   // The last of the held obstacles is held at its surface, the others at the nodes in them.
   bool holds_surface() const { return in_.heat_options[2] != 0; }
+  int64_t held_nodes() const { return int64_t(in_.held_obstacles.size()) - holds_surface(); }
+  HeatHoldArguments<T, D> hold(int64_t k, const T* capacity) const;
   HeatLayersArguments<T, D> layers(const Field<const T>& x, const Field<const int>& scene) const;
   HeatFromSurfaceArguments<T, D> from_surface() const;
   const Tensor& exchange_of_particles() const { return exchange_of_particles_; }
 
  private:
   int64_t particles() const { return in_.x.size(0); }
-  int64_t held_nodes() const { return int64_t(in_.held_obstacles.size()) - holds_surface(); }
   // Tensors of the boundaries: held temperatures, numbers of the terms, power of the source; absent ones are empty.
   enum Boundaries : size_t { kHeld, kNumbers, kPower, kBoundaries };
   bool given(Boundaries k) const { return !in_.heat_boundaries.empty() && in_.heat_boundaries[k].numel() > 0; }
@@ -285,16 +286,25 @@ HeatFromSurfaceArguments<T, D> HeatSteps<T, D>::from_surface() const {
           static_cast<const T*>(exchange_.data_ptr()), static_cast<T*>(source_.data_ptr())};
 }
 
+// The nodes in a held obstacle.
+template <class T, int D>
+HeatHoldArguments<T, D> HeatSteps<T, D>::hold(int64_t k, const T* capacity) const {
+  return {s_.contact,
+          s_.p2g.topology,
+          int(in_.held_obstacles[size_t(k)]),
+          held_temperature(k),
+          temperatures_.stride[1],
+          capacity,
+          static_cast<T*>(start_.data_ptr()),
+          static_cast<bool*>(fixed_.data_ptr())};
+}
+
 // Sets which nodes stay at which temperatures.
 template <class T, int D>
 void HeatSteps<T, D>::hold_nodes(HeatArguments<T, D>& a, backend::Stream stream) {
   T* const start = static_cast<T*>(start_.data_ptr());
   bool* const fixed = static_cast<bool*>(fixed_.data_ptr());
-  for (int64_t k = 0; k < held_nodes(); k++)
-    backend::heat_hold(
-        HeatHoldArguments<T, D>{s_.contact, s_.p2g.topology, int(in_.held_obstacles[size_t(k)]), held_temperature(k),
-                                temperatures_.stride[1], a.heat_capacity, start, fixed},
-        stream);
+  for (int64_t k = 0; k < held_nodes(); k++) backend::heat_hold(hold(k, a.heat_capacity), stream);
   a.theta = start;
   a.fixed = fixed;
 }

@@ -15,6 +15,7 @@ struct Adjoints {
   Tensor parameters;             // [P, n], of all laws
   Tensor dt;                     // [P], with respect to dt * scene_dt, without gravity
   Tensor heat, heat_parameters;  // [P, m] in the order of the result, [P, kHeatParameters]
+  Tensor heat_boundaries;        // [B, m], see HeatAdjoints
   Tensor heat_status;            // of the adjoint solves
 };
 
@@ -26,7 +27,8 @@ enum Need : int64_t {
   kGravity = 8,
   kObstacles = 16,
   kTimeStep = 32,
-  kHeatParameters_ = 64
+  kHeatParameters_ = 64,
+  kHeatBoundaries = 128
 };
 
 // Adjoints summed over the grid, undefined if not wanted: of gravity, by blocks of the domain, and of the table of
@@ -76,7 +78,7 @@ class SubstepsBackward {
  private:
   // Those of the heat of a step, which adds to the adjoint of the velocity gradient after the step.
   static HeatAdjoints heat_adjoints(const Adjoints& a) {
-    return {a.heat, a.heat_parameters, a.C, a.mass, a.volume, a.dt, a.heat_status};
+    return {a.heat, a.heat_parameters, a.C, a.mass, a.volume, a.dt, a.heat_boundaries, a.heat_status};
   }
 
   // The adjoints of the motion of the nodes in a step.
@@ -395,7 +397,7 @@ void set(Tensor& adjoint, const OptionalTensor& grad, const char* name, const Te
 }
 
 using Gradients = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor,
-                             Tensor, Tensor, Tensor, Tensor>;
+                             Tensor, Tensor, Tensor, Tensor, Tensor>;
 
 // The list of the adjoints of the results. An op has at most 64 arguments, the bits of the dispatcher.
 enum Result : size_t { kX, kV, kC, kF, kJ, kHistory, kImpulse, kHeat, kResults };
@@ -427,6 +429,8 @@ Gradients substeps_backward(const std::vector<OptionalTensor>& grads, int64_t ne
     if (const int64_t columns = backward.heat_columns(); columns > 0) {
       adjoints.heat = empty_particles(x, {P, columns});
       adjoints.heat_parameters = result(x, needs & kHeatParameters_, {P, int64_t(kHeatParameters)});
+      const int64_t numbers = 2 * int64_t(in.heat_terms.size()) + int64_t(in.held_obstacles.size());
+      if ((needs & kHeatBoundaries) && numbers > 0) adjoints.heat_boundaries = zeros(x, {in.scenes, numbers});
       adjoints.heat_status = empty(x, {in.scenes, int64_t(kHeatStatusSize)}, ScalarType::Double);
       torch::stable::zero_(adjoints.heat_status);
     }
@@ -445,13 +449,21 @@ Gradients substeps_backward(const std::vector<OptionalTensor>& grads, int64_t ne
     if (P > 0) with_team(P * n, [&] { backward.run(adjoints, sums); });
   });
   if (!has(C)) adjoints.C = Tensor();
-  return {adjoints.x,          adjoints.v,
-          adjoints.C,          adjoints.F,
-          adjoints.J,          adjoints.history,
-          adjoints.mass,       adjoints.volume,
-          adjoints.parameters, sums.gravity,
-          sums.obstacles,      adjoints.dt,
-          adjoints.heat,       adjoints.heat_parameters,
+  return {adjoints.x,
+          adjoints.v,
+          adjoints.C,
+          adjoints.F,
+          adjoints.J,
+          adjoints.history,
+          adjoints.mass,
+          adjoints.volume,
+          adjoints.parameters,
+          sums.gravity,
+          sums.obstacles,
+          adjoints.dt,
+          adjoints.heat,
+          adjoints.heat_parameters,
+          adjoints.heat_boundaries,
           adjoints.heat_status};
 }
 
@@ -463,7 +475,7 @@ STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
   m.def("substeps_backward(Tensor?[] grads, int needs, Tensor? record, " MPM_SUBSTEPS_SCHEMA
         ") -> (Tensor x, Tensor v, Tensor C, Tensor F, Tensor J, Tensor history, Tensor mass, Tensor volume, "
         "Tensor parameters, Tensor gravity, Tensor obstacles, Tensor dt, Tensor heat, Tensor heat_parameters, Tensor "
-        "heat_status)");
+        "heat_boundaries, Tensor heat_status)");
 }
 #endif
 

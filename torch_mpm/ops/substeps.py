@@ -38,7 +38,7 @@ constant of Stefan and Boltzmann; and ambient temperature), and the power of a s
 [0]. The columns of the result `heat` [P, m] are temperature, gradient and liquid fraction; `heat_status` [B, 3] has
 the number of solves that missed the tolerance, their largest residual [K], and the largest diffusion number of
 particles whose liquid fraction changed. With laws of temperature, heat is computed without gradients, where `resident`
-is true. The numbers of boundaries have no gradients, and obstacles have none beside a held surface.
+is true. Obstacles have no gradients beside a held surface.
 
 Where temperatures change, a name in `laws` may be that of a solid and, after a ~, of its liquid, as `Melting` has them.
 `thermal` are records of three numbers: a law, one of its parameters or -1 for the linear expansion of its material or
@@ -57,25 +57,27 @@ others. The second returns the schedule of the latest call of this thread on the
 Several times a second both ops run the handlers of signals, on the main thread. Where one of them raises, the op ends
 with a RuntimeError and without a result; `torch_mpm.rollout` raises the exception of the handler.
 
-Differentiable once, with respect to x, v, mass, volume, C, F, J, history, parameters, gravity, obstacles, impulse, heat
-and scene_dt, the last without FLIP and without the dependence of obstacles on the time. Autograd stores the arguments
-of a call and the record, if any: 2 D + 2 D² numbers per particle of a solid (24 in 3-D) and its history.
+Differentiable once, with respect to x, v, mass, volume, C, F, J, history, parameters, gravity, obstacles, impulse,
+heat, heat_boundaries and scene_dt, the last without FLIP and without the dependence of obstacles on the time. Autograd
+stores the arguments of a call and the record, if any: 2 D + 2 D² numbers per particle of a solid (24 in 3-D) and its
+history.
 
     torch.ops.torch_mpm.substeps_backward(grads, needs, record, *arguments of substeps)
         -> (x, v, C, F, J, history, mass, volume, parameters, gravity, obstacles, dt, heat, heat_parameters,
-            heat_status)
+            heat_boundaries, heat_status)
 
 recomputes the steps, where there is no record, and then computes their adjoints in reverse order; a record must be that
 of `substeps`, and its contents are not checked. `grads` are the adjoints of the results x, v, C, F, J, history, impulse
 and heat, None where they are zero: one list, since an op has at most 64 arguments. Meanwhile it stores the inputs of
 each step: for a solid 2 D + 3 D² numbers per particle and step (33 in 3-D), D² more where a law is plastic, the history
 and the columns of heat; and the grid of each step where that is at most half as much. The node temperatures of each
-step are solved again, and those of its adjoint once. The adjoints are [P, ...], those of the parameters [P, number of
-parameters] and that of gravity, over the time step, a sum for each block of the grids of all scenes [B * blocks, D];
-that of the time step, but for gravity, is [P]. Those of the parameters of heat are [P, 4], in the order of
-conductivity, specific heat, melting point and latent heat; `heat_status` is that of the adjoint solves. The bits of
-`needs` (`MASS`, `VOLUME`, `PARAMETERS`, `GRAVITY`, `OBSTACLES`, `TIME_STEP`, `HEAT_PARAMETERS`) select among the
-adjoints from that of mass on.
+step are solved again where no grid is stored, and those of its adjoint once. The adjoints are [P, ...], those of the
+parameters [P, number of parameters] and that of gravity, over the time step, a sum for each block of the grids of all
+scenes [B * blocks, D]; that of the time step, but for gravity, is [P]. Those of the parameters of heat are [P, 5], in
+the order of conductivity, specific heat, melting point, latent heat and power; `heat_boundaries` [B, m] are those of
+both numbers of each term and of the temperatures of the held obstacles; `heat_status` is that of the adjoint solves.
+The bits of `needs` (`MASS`, `VOLUME`, `PARAMETERS`, `GRAVITY`, `OBSTACLES`, `TIME_STEP`, `HEAT_PARAMETERS`,
+`HEAT_BOUNDARIES`) select among the adjoints from that of mass on.
 """
 
 from __future__ import annotations
@@ -91,7 +93,7 @@ from .arguments import refuse_vmap, sizes, soa_empty, sum_by_scene
 from .autograd import dispatch, register_autograd
 from .law import _entries, _of_history, _of_parameters
 
-MASS, VOLUME, PARAMETERS, GRAVITY, OBSTACLES, TIME_STEP, HEAT_PARAMETERS = 1, 2, 4, 8, 16, 32, 64
+MASS, VOLUME, PARAMETERS, GRAVITY, OBSTACLES, TIME_STEP, HEAT_PARAMETERS, HEAT_BOUNDARIES = (1 << k for k in range(8))
 """Bits of `needs` in csrc/rollout/substeps_backward.op.cpp."""
 
 _SCHEMA = {a.name: str(a.type) for a in torch.ops.torch_mpm.substeps.default._schema.arguments}
@@ -99,8 +101,8 @@ ARGUMENTS = tuple(_SCHEMA)
 """Names of the arguments of `substeps`."""
 _TENSORS = [name for name, kind in _SCHEMA.items() if kind in ("Tensor", "Optional[Tensor]")]
 _ADJOINTS = ("x", "v", "C", "F", "J", "history", "mass", "volume", "parameters", "gravity", "obstacles", "dt", "heat",
-             "heat_parameters", "heat_status")  # fmt: skip
-_LISTS = ("history", "parameters", "heat")
+             "heat_parameters", "heat_boundaries", "heat_status")  # fmt: skip
+_LISTS = ("history", "parameters", "heat", "heat_boundaries")
 """Lists of tensors that the op is differentiable by."""
 
 
@@ -161,6 +163,7 @@ def _backward_fake(grads, needs, record, *arguments):
     x, history = given["x"], given["history"]
     P, D = sizes(x, "x", 2)
     blocks = given["scenes"] * math.prod(given["layout"][2:])
+    numbers = 2 * len(given["heat_terms"]) + len(given["held_obstacles"])
     shapes = {"x": (P, D), "v": (P, D), "C": (P, D, D), "F": (P, D, D), "J": (P,)}
     return (
         *(None if given[name] is None else soa_empty(x, shape) for name, shape in shapes.items()),
@@ -172,7 +175,8 @@ def _backward_fake(grads, needs, record, *arguments):
         torch.empty_like(given["obstacles"]) if needs & OBSTACLES and given["obstacles"] is not None else None,
         soa_empty(x, (P,)) if needs & TIME_STEP else None,
         soa_empty(x, (P, _columns_of_heat(given, D))) if given["heat"] else None,
-        soa_empty(x, (P, 4)) if needs & HEAT_PARAMETERS and given["heat"] else None,
+        soa_empty(x, (P, 5)) if needs & HEAT_PARAMETERS and given["heat"] else None,
+        x.new_empty((given["scenes"], numbers)) if needs & HEAT_BOUNDARIES and given["heat"] and numbers else None,
         x.new_empty((given["scenes"], 3), dtype=torch.float64) if given["heat"] else None,
     )
 
@@ -201,11 +205,12 @@ def _saved(ctx: Any) -> tuple[Tensor | None, dict[str, Any]]:
 
 def _backward(ctx: Any, *grads: Any) -> Any:
     record, given = _saved(ctx)
-    history, parameters, heat = (given[name] for name in _LISTS)
+    history, parameters, heat, boundaries = (given[name] for name in _LISTS)
     wanted = dict(zip(_SCHEMA, ctx.needs_input_grad, strict=True))
     wants_dt = wanted["scene_dt"]
     needs = MASS * wanted["mass"] + VOLUME * wanted["volume"] + GRAVITY * (wanted["gravity"] or wants_dt)
-    needs += TIME_STEP * wants_dt + HEAT_PARAMETERS * any(wanted["heat"])
+    needs += TIME_STEP * wants_dt + HEAT_PARAMETERS * any([*wanted["heat"], *wanted["heat_boundaries"][2:]])
+    needs += HEAT_BOUNDARIES * any(wanted["heat_boundaries"][:2])
     needs += PARAMETERS * any(wanted["parameters"]) + OBSTACLES * wanted["obstacles"]
     by_impulse = None if grads[7] is None else grads[7].contiguous()
     arguments = (given[name] for name in _SCHEMA)
@@ -214,11 +219,14 @@ def _backward(ctx: Any, *grads: Any) -> Any:
     found = dict(zip(_ADJOINTS, adjoints, strict=True)) | {"impulse": grads[7]}
     if found["heat_status"] is not None and hasattr(ctx, "report"):
         ctx.report(found["heat_status"])
-    for name in ("heat_boundaries", "tables"):
-        found[name] = [None] * len(given[name])
+    found["tables"] = [None] * len(given["tables"])
     found["history"] = _of_history(found["history"], history, wanted["history"])
     found["parameters"] = _of_parameters(found["parameters"], parameters, wanted["parameters"], given["scene"])
-    found["heat"] = _of_heat(found["heat"], found["heat_parameters"], heat, wanted["heat"], given["scene"])
+    of_parameters, scene = found["heat_parameters"], given["scene"]
+    found["heat"] = _of_heat(found["heat"], of_parameters, heat, wanted["heat"], scene)
+    found["heat_boundaries"] = _of_boundaries(
+        found["heat_boundaries"], of_parameters, boundaries, wanted["heat_boundaries"], scene
+    )
     by_dt = found.pop("dt")
     if wants_dt:
         sums = sum_by_scene(by_dt, given["scene"], given["scenes"])  # One scene by default.
@@ -230,15 +238,15 @@ def _backward(ctx: Any, *grads: Any) -> Any:
         found["gravity"] = dt * change
         if wants_dt:
             found["scene_dt"] = found["scene_dt"] + given["dt"] * (given["gravity"] * change).sum(1)
-    lists = (*_LISTS, "heat_boundaries", "tables")
+    lists = (*_LISTS, "tables")
     return tuple(found.get(name) if name in lists or wanted[name] is True else None for name in _SCHEMA)
 
 
 def _of_heat(
     fields: Tensor | None, parameters: Tensor | None, heat: list[Tensor], wanted: list[bool], scene: Tensor | None
 ) -> list[Tensor | None]:
-    """Gradients of the tensors of `heat`, from those of the columns of the result and of the parameters [P, 4]."""
-    if fields is None or parameters is None:
+    """Gradients of the tensors of `heat`, from those of the columns of the result and of the parameters [P, 5]."""
+    if fields is None or parameters is None or not any(wanted):
         return [None] * len(heat)
     melts, dim = len(heat) >= 6, heat[-1].shape[1] if len(heat) % 3 == 1 else 0
     places = [1, 2, *([4, 5] if melts else [])]
@@ -249,6 +257,20 @@ def _of_heat(
     if dim:
         grads[len(heat) - 1] = fields[:, 1 : 1 + dim]
     return [grads[k] if wanted[k] else None for k in range(len(heat))]
+
+
+def _of_boundaries(
+    sums: Tensor | None, parameters: Tensor | None, given: list[Tensor], wanted: list[bool], scene: Tensor | None
+) -> list[Tensor | None]:
+    """Gradients of `heat_boundaries`, from those of numbers and temperatures [B, m] and of the parameters [P, 5]."""
+    grads: list[Tensor | None] = [None] * len(given)
+    if sums is not None:
+        first = 2 * given[1].shape[0] if given[1].numel() else 0
+        grads[0] = sums[:, first:].T if wanted[0] else None
+        grads[1] = sums[:, :first].unflatten(1, (-1, 2)).transpose(0, 1) if wanted[1] else None
+    if parameters is not None and wanted[2:] == [True]:
+        (grads[2],) = _of_parameters(parameters[:, 4:], given[2:], wanted[2:], scene)
+    return grads
 
 
 def _no_second_derivatives(ctx: Any, *grads: Any) -> None:

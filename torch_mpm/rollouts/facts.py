@@ -12,6 +12,7 @@ from .._library import graph_loops
 from ..boundaries import Obstacle
 from ..boundaries.obstacles import motion_tensors
 from ..cuda_graphs.capture import is_captured
+from ..heat.boundaries import Term
 from ..heat.heat import Heat
 from ..laws import CompiledLaw
 from ..laws.active import Active
@@ -195,6 +196,7 @@ def _differentiable(step: Step, state: State) -> list[Tensor]:
 
 
 def _parameters_of_heat(heat: Heat) -> list[Tensor]:
-    """Tensors among the parameters of heat."""
+    """Tensors among the parameters of heat and the numbers of its boundaries."""
     parts = [part for v in heat.parameter_values for part in (v.values() if isinstance(v, PerMaterial) else (v,))]
-    return [part for part in parts if isinstance(part, Tensor)]
+    terms = [t for term in heat.boundaries.entries if isinstance(term, Term) for t in tensors_in(term)]
+    return [*(part for part in parts if isinstance(part, Tensor)), *terms]

@@ -75,8 +75,8 @@ def _why_not_boundaries(step: Step, heat: Heat) -> str | None:
             return f"{type(term).__name__} acts on points of a surface"
         for name in _names(term):
             value = getattr(term, name)
-            if _is_function(value) or (isinstance(value, Tensor) and value.requires_grad):
-                return f"{name} of {type(term).__name__} is a function, or requires a gradient"
+            if _is_function(value):
+                return f"{name} of {type(term).__name__} is a function"
             if type(term) is Source or not isinstance(value, Tensor):
                 continue
             if value.shape not in ((), (1,), (heat.grid.scenes,)):
@@ -125,7 +125,7 @@ def _held(step: Step, x: Tensor) -> tuple[list[int], int, Tensor]:
 
 def _of_scenes(value: Any, like: Tensor, scenes: int) -> Tensor:
     """A value for each scene [B], from one of a shape that `_why_not_boundaries` supports."""
-    return _like(value, like).detach().reshape(-1).expand(scenes)
+    return _like(value, like).reshape(-1).expand(scenes)
 
 
 def _like(value: Any, like: Tensor) -> Tensor:
