@@ -1,4 +1,4 @@
-#include "heat/backward.h"
+#include "heat/local_backward.h"
 #include "transfer/gather.cpu.h"
 
 // Adjoint of a step of heat, one pass over the particles for G2P and one for P2G.

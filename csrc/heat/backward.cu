@@ -1,4 +1,4 @@
-#include "heat/backward.h"
+#include "heat/local_backward.h"
 
 #include "cuda/for_each.cuh"
 #include "heat/kernels.h"
