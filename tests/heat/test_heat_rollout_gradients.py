@@ -56,7 +56,7 @@ def gradients(run, step, state, n, dt, of=STATE, **options):
     """Gradients of a loss of some fields by all leaves, zero where a leaf takes no part."""
     state, leaves = with_leaves(step, state)
     if isinstance(dt, torch.Tensor):
-        dt = leaves["dt"] = dt.detach().to(state.x.device).clone().requires_grad_(not step.flip)
+        dt = leaves["dt"] = dt.detach().clone().requires_grad_(not step.flip)
     end = run(step, state, n, dt, **options)
     leaves = {name: leaf for name, leaf in leaves.items() if leaf.requires_grad}
     grads = torch.autograd.grad(loss_of(end, of), list(leaves.values()), allow_unused=True, materialize_grads=True)
@@ -64,7 +64,11 @@ def gradients(run, step, state, n, dt, of=STATE, **options):
 
 
 def compare(step, state, n=6, dt=DT, tolerance=1e-10, of=STATE, **options):
-    """Gradients of the op are those of single steps, relative to the largest of each; returns the former."""
+    """Gradients of the op are those of single steps, relative to the largest of each; returns the former. On CUDA sums
+    of nodes have another order in each run."""
+    device = state.x.device
+    step, dt = step.to(device), dt.to(device) if isinstance(dt, torch.Tensor) else dt
+    tolerance *= 10 if state.x.is_cuda else 1
     step.heat.tolerance, state = 1e-12 if state.x.dtype == F64 else 1e-6, melting(state)
     assert plan_rollout(step, with_leaves(step, state)[0], n, dt).executor == "fused"
     found = gradients(mpm.rollout, step, state, n, dt, of, **options)
@@ -132,7 +136,7 @@ def test_parameters_of_materials(device):
         end = run(step, state, 4, DT)
         grads.append(torch.stack(torch.autograd.grad(loss_of(end), parts)))
     assert plan_rollout(step, state, 4, DT).executor == "fused" and bool((grads[0] != 0).all())
-    torch.testing.assert_close(*grads, rtol=1e-10, atol=0)
+    torch.testing.assert_close(*grads, rtol=1e-9, atol=0)
 
 
 @pytest.mark.parametrize("transfer", TRANSFERS)
@@ -180,7 +184,7 @@ def test_gradcheck(transfer, melts, device):
     scaled = [torch.tensor(v, dtype=F64, device=device) for v in numbers]
     leaves = [getattr(state, name) for name in names[:4]] + [*state.extra.values(), *scaled]
     leaves = [t.detach().clone().requires_grad_() for t in leaves]
-    assert torch.autograd.gradcheck(run, leaves, eps=1e-6, atol=1e-6, rtol=1e-5)
+    assert torch.autograd.gradcheck(run, leaves, eps=1e-6, atol=1e-6, rtol=1e-5, nondet_tol=1e-9)
 
 
 @pytest.mark.parametrize("transfer", TRANSFERS)
@@ -327,7 +331,10 @@ def test_reasons_for_single_steps(device):
     region = bodies(2)["plane"]
     step = held(step, (heat_boundaries.FixedSurface, region, 1.0))
     assert plan_rollout(step, state, 3, DT).executor == "fused"
-    step.boundaries = [*step.boundaries.entries, mpm.Sphere(torch.tensor([0.1, 0.1], requires_grad=True), 0.05)]
+    step.boundaries = [
+        *step.boundaries.entries,
+        mpm.Sphere(torch.tensor([0.1, 0.1], device=device, requires_grad=True), 0.05),
+    ]
     reason = "a surface is held at a temperature, and a gradient is wanted by an obstacle"
     assert plan_rollout(step, state, 3, DT).reasons["fused"] == reason
     step.boundaries = step.boundaries.entries[:-1]
