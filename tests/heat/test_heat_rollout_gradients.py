@@ -198,7 +198,7 @@ def test_differences_over_200_steps_with_melting(transfer, device):
         given = copy.deepcopy(step)
         start, leaves = with_leaves(given, state)
         leaf = leaves[name]
-        move = float(leaf.abs().max()) * torch.rand(leaf.shape, generator=torch.Generator().manual_seed(4), dtype=F64)
+        move = float(leaf.detach().abs().max()) * torch.rand(leaf.shape, generator=torch.Generator().manual_seed(4), dtype=F64)
         with torch.no_grad():
             leaf += shift * move.to(leaf)
         after = mpm.rollout(given, start, 200, DT)
