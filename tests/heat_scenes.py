@@ -86,3 +86,34 @@ def terms(scenes=1, particles=0):
         "radiation": [heat_boundaries.Radiation(surface, 0.9, 3000.0)],
         "source": [heat_boundaries.Source(2e8 * (torch.ones(particles).double() if particles else each[:1]))],
     }
+
+
+Table = mpm.Table
+SOFTENING = Table([-10.0, 2.0, 20.0], [2e5, 1e5, 1e4])
+WATER = {"bulk_modulus": 1e5, "viscosity": 5.0}
+THERMAL = {
+    "softening": lambda: mpm.NeoHookean(E=SOFTENING, nu=0.3),
+    "thinning": lambda: mpm.WeaklyCompressible(1e5, 7.0, Table([0.0, 5.0], [10.0, 1.0])),
+    "two tables": lambda: mpm.VonMises(E=SOFTENING, nu=0.3, yield_stress=Table([0.0, 6.0], [3e2, 1e2])),
+    "expansion": lambda: mpm.ThermalExpansion(mpm.NeoHookean(E=1e5, nu=0.3), 1e-3),
+    "expansion by a table": lambda: mpm.ThermalExpansion(mpm.Hencky(E=1e5, nu=0.3), Table([0.0, 5.0], [1e-3, 2e-3])),
+    "expansion and flow": lambda: mpm.ThermalExpansion(mpm.VonMises(E=SOFTENING, nu=0.3, yield_stress=1e2), 1e-3),
+    "expanding fluid": lambda: mpm.ThermalExpansion(mpm.WeaklyCompressible(1e5), 1e-3),
+    "expanding sand": lambda: mpm.ThermalExpansion(named("sand")["sand"](), 1e-3),
+    "melting": lambda: mpm.Melting(mpm.FixedCorotated(E=1e5, nu=0.3), mpm.WeaklyCompressible(**WATER)),
+    "melting and flow": lambda: mpm.Melting(named("von_mises")["von_mises"](), mpm.WeaklyCompressible(**WATER), 0.3),
+    "wax": lambda: mpm.ThermalExpansion(
+        mpm.Melting(mpm.NeoHookean(E=SOFTENING, nu=0.3), mpm.WeaklyCompressible(**WATER), 0.5), 1e-3
+    ),
+}
+
+
+def thermal(names, dim=3, dtype=torch.float64, scenes=1, device="cpu", **options):
+    """A scene of laws that read the temperature, of each or of a mixture."""
+    step, state = scene(dim, dtype, scenes, melts=True, **options)
+    laws = [THERMAL[name]() if name in THERMAL else named(name)[name]() for name in names]
+    step.law = laws[0] if len(laws) == 1 else mpm.Mixture(laws)
+    material = (torch.arange(len(state)) % len(laws)).int() if len(laws) > 1 else None
+    liquid = {"liquid": torch.rand(len(state), generator=torch.Generator().manual_seed(2)).to(dtype)}
+    state = state.replace(F=None, J=None, material=material, extra=state.extra | liquid)
+    return step.to(device), step.prepare(state.to(device=device))

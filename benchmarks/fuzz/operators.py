@@ -230,7 +230,7 @@ class _Calls:
         table = torch.stack([torch.arange(3, dtype=self.dtype), 1 + self.uniform(3)])
         conducts = (heat, [0, 9, 1], [1e-3, 273.0, 0.5, 1e-6], [1, 0], [0, 1, 2], bounds)
         hot = (*self.obstacles, 0.1, 2, 40, True, True, False, None, *clocks, *conducts, [0, 1, 0], [table])
-        warm = (*self.obstacles, 0.1, 2, 40, True, False, False, None, *clocks, *conducts, [], [])
+        warm = (*self.obstacles, 0.1, 2, 40, True, False, False, None, *clocks, *conducts, [0, 1, 0], [table])
         look = (*fields[:5], self.F, *self.uniform(4, P), self.scene, 50.0, 2.0, True, 0.1, self.lattice.upper, 2)
         start = (*fields, 0.5 + self.uniform(P), None, [self.uniform(P)], *who, *laws, *how)
         call, with_heat, with_adjoint = ((*start, *parts, *self.lattice.packed) for parts in (end, hot, warm))

@@ -3,6 +3,7 @@
 #include "common/signals.h"
 #include "rollout/heat_steps.h"
 #include "rollout/step_kernels.h"
+#include "rollout/thermal_laws.op.h"
 
 // n steps with a record of the inputs of their adjoints: the particles of each step with their heat, and its active
 // blocks and nodes if these need less memory than the particles.
@@ -86,6 +87,7 @@ class Recorded {
  public:
   Substeps<T, D> steps;
   std::optional<HeatSteps<T, D>> heat;
+  std::optional<ThermalLaws<T, D>> thermal;
   Record<T> x, v, C, F, J, residual, history, stress;
   Record<T> mapped;      // F after the return maps
   Record<T> heat_after;  // temperature, gradient and liquid fraction
@@ -253,8 +255,9 @@ Recorded<T, D>::Recorded(const SubstepsInputs& in, const OptionalTensor& memory,
   if (HeatSteps<T, D>::wanted(in)) {
     heat.emplace(steps);
     first_heat_ = copy_of(heat->state());
-    steps.laws_are_apart = heat->heats_by_laws();
   }
+  if (ThermalLaws<T, D>::wanted(steps)) thermal.emplace(steps, heat ? &*heat : nullptr);
+  steps.laws_are_apart = thermal || (heat && heat->heats_by_laws());
   steps.forget_stress();  // each step has its own stress
   steps.fuse(true);
   steps.activation.workspace_size = backend::activate_workspace(steps.activation, stream);
@@ -341,7 +344,8 @@ bool Recorded<T, D>::run() {
     steps.write({x[i], v[i], C[i], F[i], J[i], residual[i], history[i]});
     if (has(in_.material)) keep_others(i);
     if (heat) begin_heat(i);
-    steps.run_laws(stream_);
+    if (thermal) thermal->read({}, {});
+    thermal ? thermal->run(stream_) : steps.run_laws(stream_);
     steps.move(stream_);
     if (heat) conduct_heat(i);
     steps.end_time(stream_);

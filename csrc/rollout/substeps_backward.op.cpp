@@ -46,6 +46,8 @@ class SubstepsBackward {
 
   int64_t columns() const { return s_.columns; }  // of the history of all laws
   int64_t blocks() const { return s_.update.block_count; }
+  // Laws of temperature pass the adjoints of their parameters on.
+  bool wants_parameters(int64_t needs) const { return (needs & kParameters_) || r_.thermal; }
   int64_t heat_columns() const { return r_.heat ? r_.heat->state_columns() : 0; }
 
   // The adjoints of the final state become those of the initial state; the others are accumulated.
@@ -68,7 +70,10 @@ class SubstepsBackward {
       backward_advance(i, adjoints);
       backward_grid(i, adjoints, sums);
       if (s_.flips()) backward_kept(adjoints);
+      if (r_.thermal) r_.thermal->read({}, {}), r_.thermal->begin(stream_);
       backward_laws(adjoints, heat ? heat->dissipated : absent());
+      if (r_.thermal)
+        r_.thermal->backward(field<T>(adjoints.parameters), HeatSteps<T, D>::column_of(adjoints.heat, 0), stream_);
       if (heat) add_terms({{adjoints.x, heat->x_term}, {adjoints.F, heat->F_term}, {adjoints.J, heat->J_term}});
       if (adjoints.dt.defined()) add_terms({{adjoints.dt, motion_dt_}, {adjoints.dt, stress_dt_}});
       after_substeps(in_.x.size(0), 1, stream_);
@@ -170,7 +175,7 @@ void SubstepsBackward<T, D>::make_terms(int64_t needs) {
     changing |= info.changes();
   }
   F_term_ = result(x, history, {P, D, D});
-  parameters_term_ = result(x, changing && (needs & kParameters_), {P, int64_t(in_.parameters.size())});
+  parameters_term_ = result(x, changing && wants_parameters(needs), {P, int64_t(in_.parameters.size())});
   for (Tensor* term : {&F_term_, &parameters_term_})  // zero for the particles of other laws
     if (term->defined()) torch::stable::zero_(*term);
 }
@@ -424,7 +429,7 @@ Gradients substeps_backward(const std::vector<OptionalTensor>& grads, int64_t ne
     adjoints.history = result(x, backward.columns() > 0, {P, backward.columns()});
     adjoints.mass = result(x, needs & kMass, {P});
     adjoints.volume = result(x, needs & kVolume, {P});
-    adjoints.parameters = result(x, needs & kParameters_, {P, int64_t(parameters.size())});
+    adjoints.parameters = result(x, backward.wants_parameters(needs), {P, int64_t(parameters.size())});
     adjoints.dt = result(x, needs & kTimeStep, {P});
     if (const int64_t columns = backward.heat_columns(); columns > 0) {
       adjoints.heat = empty_particles(x, {P, columns});
@@ -449,6 +454,7 @@ Gradients substeps_backward(const std::vector<OptionalTensor>& grads, int64_t ne
     if (P > 0) with_team(P * n, [&] { backward.run(adjoints, sums); });
   });
   if (!has(C)) adjoints.C = Tensor();
+  if (!(needs & kParameters_)) adjoints.parameters = Tensor();
   return {adjoints.x,
           adjoints.v,
           adjoints.C,

@@ -5,7 +5,7 @@ import random
 
 import pytest
 import torch
-from heat_scenes import DT, LAWS, TRANSFERS, bodies, composed, held, scene, terms
+from heat_scenes import DT, LAWS, THERMAL, TRANSFERS, bodies, composed, held, scene, terms, thermal
 from pairs import in_pairs
 
 import torch_mpm as mpm
@@ -198,7 +198,9 @@ def test_differences_over_200_steps_with_melting(transfer, device):
         given = copy.deepcopy(step)
         start, leaves = with_leaves(given, state)
         leaf = leaves[name]
-        move = float(leaf.detach().abs().max()) * torch.rand(leaf.shape, generator=torch.Generator().manual_seed(4), dtype=F64)
+        move = float(leaf.detach().abs().max()) * torch.rand(
+            leaf.shape, generator=torch.Generator().manual_seed(4), dtype=F64
+        )
         with torch.no_grad():
             leaf += shift * move.to(leaf)
         after = mpm.rollout(given, start, 200, DT)
@@ -324,6 +326,20 @@ def test_plastic_heating(dim, name, with_source, device):
     assert float((found["v"] - without["v"]).abs().max()) > 1e-6 * float(found["v"].abs().max())
 
 
+TABLES = ("softening", "thinning", "two tables")
+
+
+@pytest.mark.parametrize(*in_pairs(name=[*TABLES, "mixture"], dim=[2, 3], share=[0.0, 0.9], scenes=[1, 2]))
+def test_tables_of_laws(dim, name, share, scenes, device):
+    """Laws whose parameters are tables of the temperature, through which it moves the particles."""
+    names = [*TABLES, "neo_hookean"] if name == "mixture" else [name]
+    step, state = thermal(names, dim, scenes=scenes, device=device)
+    step.heat.plastic_heating = share
+    state = step.prepare(state.replace(v=40 * (state.x - 0.45).flip(1)))  # shear
+    found = compare(step, state, 5, torch.linspace(1, 2, scenes, dtype=F64) * DT, 1e-9, of=["v"])
+    assert float(found["temperature"].abs().max()) > 0
+
+
 def test_reasons_for_single_steps(device):
     """What the op has no adjoint of."""
     step, state = scene(2, device=device)
@@ -338,6 +354,12 @@ def test_reasons_for_single_steps(device):
     reason = "a surface is held at a temperature, and a gradient is wanted by an obstacle"
     assert plan_rollout(step, state, 3, DT).reasons["fused"] == reason
     step.boundaries = step.boundaries.entries[:-1]
+    step.law = THERMAL["expansion"]()
+    reason = "a law expands or melts, and a gradient is wanted"
+    assert plan_rollout(step, state, 3, DT).reasons["fused"] == reason
+    step.law = mpm.NeoHookean(E=mpm.Table([0.0, 9.0], torch.tensor([2e5, 1e5], requires_grad=True)), nu=0.3)
+    reason = "a law reads the temperature and has parameters with gradients, and a gradient is wanted"
+    assert plan_rollout(step, state, 3, DT).reasons["fused"] == reason
     step = held(step, (heat_boundaries.Fixed, region, lambda t: t))
     assert plan_rollout(step, state, 3, DT).reasons["fused"] == "temperature of Fixed is a function"
 

@@ -5,7 +5,7 @@ import warnings
 
 import pytest
 import torch
-from heat_scenes import DT, LAWS, TRANSFERS, bodies, composed, held, scene, terms
+from heat_scenes import DT, LAWS, SOFTENING, THERMAL, TRANSFERS, bodies, composed, held, scene, terms, thermal
 from helpers import relative_error
 from pairs import in_pairs
 
@@ -286,37 +286,6 @@ def test_other_heat_goes_step_by_step(reason):
         assert torch.equal(got.temperature, composed(step, state, 2, DT).temperature)
 
 
-Table = mpm.Table
-SOFTENING = Table([-10.0, 2.0, 20.0], [2e5, 1e5, 1e4])
-WATER = {"bulk_modulus": 1e5, "viscosity": 5.0}
-THERMAL = {
-    "softening": lambda: mpm.NeoHookean(E=SOFTENING, nu=0.3),
-    "thinning": lambda: mpm.WeaklyCompressible(1e5, 7.0, Table([0.0, 5.0], [10.0, 1.0])),
-    "two tables": lambda: mpm.VonMises(E=SOFTENING, nu=0.3, yield_stress=Table([0.0, 6.0], [3e2, 1e2])),
-    "expansion": lambda: mpm.ThermalExpansion(mpm.NeoHookean(E=1e5, nu=0.3), 1e-3),
-    "expansion by a table": lambda: mpm.ThermalExpansion(mpm.Hencky(E=1e5, nu=0.3), Table([0.0, 5.0], [1e-3, 2e-3])),
-    "expansion and flow": lambda: mpm.ThermalExpansion(mpm.VonMises(E=SOFTENING, nu=0.3, yield_stress=1e2), 1e-3),
-    "expanding fluid": lambda: mpm.ThermalExpansion(mpm.WeaklyCompressible(1e5), 1e-3),
-    "expanding sand": lambda: mpm.ThermalExpansion(named("sand")["sand"](), 1e-3),
-    "melting": lambda: mpm.Melting(mpm.FixedCorotated(E=1e5, nu=0.3), mpm.WeaklyCompressible(**WATER)),
-    "melting and flow": lambda: mpm.Melting(named("von_mises")["von_mises"](), mpm.WeaklyCompressible(**WATER), 0.3),
-    "wax": lambda: mpm.ThermalExpansion(
-        mpm.Melting(mpm.NeoHookean(E=SOFTENING, nu=0.3), mpm.WeaklyCompressible(**WATER), 0.5), 1e-3
-    ),
-}
-
-
-def thermal(names, dim=3, dtype=torch.float64, scenes=1, device="cpu", **options):
-    """A scene of laws that read the temperature, of each or of a mixture."""
-    step, state = scene(dim, dtype, scenes, melts=True, **options)
-    laws = [THERMAL[name]() if name in THERMAL else named(name)[name]() for name in names]
-    step.law = laws[0] if len(laws) == 1 else mpm.Mixture(laws)
-    material = (torch.arange(len(state)) % len(laws)).int() if len(laws) > 1 else None
-    liquid = {"liquid": torch.rand(len(state), generator=torch.Generator().manual_seed(2)).to(dtype)}
-    state = state.replace(F=None, J=None, material=material, extra=state.extra | liquid)
-    return step.to(device), step.prepare(state.to(device=device))
-
-
 @pytest.mark.parametrize("name", THERMAL)
 def test_laws_that_read_the_temperature(dim, name, device):
     step, state = thermal([name], dim, device=device)
@@ -384,7 +353,7 @@ def test_tables_that_change_between_calls(change, device):
     if change == "through data" and device != "cpu":
         pytest.skip("changes through .data are not seen on CUDA (docs/concepts.md)")
     step, state = thermal(["softening"], 2, device=device)
-    step.law.E = Table(SOFTENING.temperature, SOFTENING.value.clone()).to(device)
+    step.law.E = mpm.Table(SOFTENING.temperature, SOFTENING.value.clone()).to(device)
     first = compare(step, state).v
     if change == "in place":
         step.law.E.value[1] = 2e5
@@ -398,7 +367,7 @@ def test_tables_that_change_between_calls(change, device):
 def test_temperatures_beyond_the_knots(device):
     """And at knots; a law of one temperature is that of numbers."""
     ends = []
-    for E in (Table([100.0, 101.0], [1e5, 2e5]), Table([-3.0, -2.0], [2e5, 1e5]), 1e5):
+    for E in (mpm.Table([100.0, 101.0], [1e5, 2e5]), mpm.Table([-3.0, -2.0], [2e5, 1e5]), 1e5):
         step, state = thermal(["softening"], device=device)
         step.law = mpm.NeoHookean(E=E, nu=0.3)
         ends.append(compare(step, state).v)
@@ -409,7 +378,7 @@ def test_temperatures_beyond_the_knots(device):
 UNSUPPORTED = {
     "the heat has no melting point": lambda s: setattr(s, "heat", mpm.Heat(s.grid, 2000.0, 100.0)),
     "an expansion is neither one number nor a table": lambda s: setattr(s.law, "coefficient", lambda theta: 0 * theta),
-    "a parameter of the law is a function": lambda s: setattr(s.law.law.solid, "nu", Table([0.0, 5.0], [0.2, 0.4])),
+    "a parameter of the law is a function": lambda s: setattr(s.law.law.solid, "nu", mpm.Table([0.0, 5.0], [0.2, 0.4])),
     "is more than a compiled law": lambda s: setattr(s.law.law, "solid", named("custom")["custom"]()),
 }
 
