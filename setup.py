@@ -253,13 +253,14 @@ def parts(sources: Iterable[Path]) -> list[tuple[Path, list[str]]]:
     headers = sorted(h for h in (CSRC / "laws").glob("*.h") if "\nMPM_REGISTER_LAW(" in h.read_text())
     each_law = [[f'-DMPM_LAW_HEADER="laws/{header.name}"'] for header in headers]
     names = (
+        "backward.cu",
         "gather.cu",
         "scatter.cu",
         "heat.cu",
         "heat_operator.cu",
+        "simple_steps.cu",
         "tangent_gather.cu",
         "transfer.cu",
-        "simple_steps.cu",
     )
     split = dict.fromkeys(names, shapes)
     split |= {"g2p_advance.cu": scalars, "law.cpu.cpp": each_law, "law.cu": each_law, "fused_law.cu": each_law}

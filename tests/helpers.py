@@ -42,6 +42,13 @@ def relative_error(value: Tensor, reference: Tensor) -> float:
     return float((value - reference).norm() / reference.norm().clamp_min(1e-300))
 
 
+# ---- steps
+
+
+class SingleSteps(mpm.Step):
+    """A `Step` whose rollouts are composed of single steps: the op of many steps computes no subclass."""
+
+
 # ---- particles and nodes
 
 

@@ -228,18 +228,21 @@ class _Calls:
         heat = [self.uniform(P), ones, ones, self.uniform(P), ones, 1 + self.uniform(2), self.normal(P, D)]
         bounds = [self.normal(2, 2), self.uniform(3, 2, 2), self.uniform(P)]
         table = torch.stack([torch.arange(3, dtype=self.dtype), 1 + self.uniform(3)])
-        conducts = (heat, [0, 9, 1], [1e-3, 273.0, 0.5], [1, 0], [0, 1, 2], bounds, [0, 1, 0], [table])
-        hot = (*self.obstacles, 0.1, 2, 40, True, True, False, None, *clocks, *conducts)
+        conducts = (heat, [0, 9, 1], [1e-3, 273.0, 0.5, 1e-6], [1, 0], [0, 1, 2], bounds)
+        hot = (*self.obstacles, 0.1, 2, 40, True, True, False, None, *clocks, *conducts, [0, 1, 0], [table])
+        warm = (*self.obstacles, 0.1, 2, 40, True, False, False, None, *clocks, *conducts, [0, 1, 0], [table])
         look = (*fields[:5], self.F, *self.uniform(4, P), self.scene, 50.0, 2.0, True, 0.1, self.lattice.upper, 2)
         start = (*fields, 0.5 + self.uniform(P), None, [self.uniform(P)], *who, *laws, *how)
-        call, with_heat = ((*start, *parts, *self.lattice.packed) for parts in (end, hot))
+        call, with_heat, with_adjoint = ((*start, *parts, *self.lattice.packed) for parts in (end, hot, warm))
         facts = (False, True, D, PARTICLES, 2, 5, 27, 27, True, *[False] * 10, 1, *[False] * 8, 0, False)
         figures = (self.x, *call[4:7], call[8], self.scene, material, *laws, how[0], how[1], True)
         grads = [self.normal(*t.shape) for t in torch.ops.torch_mpm.substeps(*call)[:6]]
+        of_heat = self.normal(*torch.ops.torch_mpm.substeps(*with_adjoint)[10].shape)
         return [
             ("substeps", call),
             ("substeps", with_heat),
-            ("substeps_backward", (*grads, torch.ones_like(impulse), 15, None, *call)),
+            ("substeps_backward", ([*grads, torch.ones_like(impulse), None], 15, None, *call)),
+            ("substeps_backward", ([*grads, None, of_heat], 239, None, *with_adjoint)),
             ("law_figures", figures),
             ("plan_substeps", (-1, *facts)),
             ("latest_schedule", (self.x,)),

@@ -1,6 +1,7 @@
 #pragma once
 
 #include "common/backend.h"
+#include "heat/backward.h"
 #include "heat/patches.h"
 #include "heat/solve.h"
 #include "heat/transfer.h"
@@ -39,3 +40,14 @@ MPM_BACKEND_KERNELS(MPM_HEAT_TRANSFER_KERNELS)
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda
 MPM_BACKEND_KERNELS(MPM_HEAT_SIMPLE_KERNELS)
 #endif
+
+#define MPM_HEAT_BACKWARD_KERNELS(PLAIN, ORDERED, SIZE)                             \
+  ORDERED(heat_to_particles_backward, HeatToParticlesBackwardArguments)             \
+  PLAIN(heat_term_backward, HeatTermBackwardArguments)                              \
+  PLAIN(heat_numbers_backward, HeatNumbersBackwardArguments)                        \
+  PLAIN(heat_held_backward, HeatHeldBackwardArguments)                              \
+  PLAIN(heat_surface_temperature_backward, HeatSurfaceTemperatureBackwardArguments) \
+  PLAIN(heat_nodes_backward, HeatNodesBackwardArguments)                            \
+  PLAIN(heat_layers_backward, HeatLayersBackwardArguments)                          \
+  ORDERED(heat_to_nodes_backward, HeatToNodesBackwardArguments)
+MPM_BACKEND_KERNELS(MPM_HEAT_BACKWARD_KERNELS)

@@ -34,11 +34,11 @@ MPM_HD void heat_volume(const HeatVolumesArguments<T, D>& a, int64_t p) {
 
 // Signed distance from an obstacle; infinite while it is not there. The kernel of contact needs no distance from the
 // edges of a box.
-template <class T, int D>
-MPM_HD T distance_from(const ObstaclePose<T, D>& pose, const Vector<T, D>& position) {
-  if (!pose.acts) return T(INFINITY);
-  const Vector<T, D> body = to_body(pose, position);
-  Vector<T, D> other;
+template <class S, int D>
+MPM_HD S distance_from(const ObstaclePose<S, D>& pose, const Vector<ValueOf<S>, D>& position) {
+  if (!pose.acts) return lift<S>(ValueOf<S>(INFINITY));
+  const Vector<S, D> body = to_body(pose, position);
+  Vector<S, D> other;
   if (pose.shape != ObstacleShape::box) return surface(pose, body, other);
   MPM_UNROLL for (int i = 0; i < D; i++)
     other[i] = pose.row->extent[i];
@@ -109,11 +109,17 @@ MPM_HD void heat_increment(const HeatIncrementsArguments<T, D>& a, int64_t i) {
   a.sums[i * kHeatChannels + kHeatTheta] = a.increment[i] + (a.start[i] - a.theta[i]);
 }
 
+// Whether an obstacle that acts contains a node of a block.
+template <class T, int D>
+MPM_HD bool is_held(const HeatHoldArguments<T, D>& a, const ObstaclePose<T, D>& pose, const int (&corner)[D],
+                    int local) {
+  return distance_from(pose, node_position(a.contact, corner, local)) <= a.contact.rounding;
+}
+
 template <class T, int D>
 MPM_HD void hold_node(const HeatHoldArguments<T, D>& a, const ObstaclePose<T, D>& pose, int scene,
                       const int (&corner)[D], int local, int64_t i) {
-  if (a.fixed[i] || !(a.capacity[i] > T(0))) return;
-  if (!(distance_from(pose, node_position(a.contact, corner, local)) <= a.contact.rounding)) return;
+  if (a.fixed[i] || !(a.capacity[i] > T(0)) || !is_held(a, pose, corner, local)) return;
   a.fixed[i] = true;
   a.theta[i] = a.temperature[scene * a.stride];
 }
@@ -123,21 +129,34 @@ MPM_HD void heat_of_surface(const HeatFromSurfaceArguments<T, D>& a, int scene, 
   a.source[i] = a.exchange[i] * a.temperature[scene * a.stride];
 }
 
+// Heat into a node by a term of the free surface, linear in its temperature θ: power − coefficient θ. The sum Σ V ∇N of
+// the node is a normal with the length of its area.
+template <class T, int D>
+MPM_HD HeatRadiationAt<T> heat_of_term(HeatTerm term, const Vector<T, D>& normal, const T& theta, const T& first,
+                                       const T& second, const T& reference) {
+  const T amount = safe_root(dot(normal, normal)) * first;
+  if (term == HeatTerm::convection) return {amount, amount * second};
+  if (term == HeatTerm::radiation) return heat_radiation(amount, theta, second, reference);
+  return {T(0), amount};  // a flux
+}
+
+template <class T, int D>
+MPM_HD Vector<T, D> normal_of_node(const HeatTermArguments<T, D>& a, int64_t i) {
+  Vector<T, D> normal;
+  MPM_UNROLL for (int d = 0; d < D; d++)
+    normal[d] = a.sums[i * kHeatChannels + 1 + d];
+  return normal;
+}
+
 template <class T, int D>
 MPM_HD void heat_term(const HeatTermArguments<T, D>& a, int scene, int64_t i) {
-  const T* const sum = a.sums + i * kHeatChannels;
   if (a.term == HeatTerm::power) {
-    a.source[i] += sum[0];
+    a.source[i] += a.sums[i * kHeatChannels];
     return;
   }
-  T squared = T(0);
-  MPM_UNROLL for (int d = 0; d < D; d++)
-    squared += sum[1 + d] * sum[1 + d];
   const T* const number = a.number + 2 * int64_t(scene);
-  const T amount = safe_root(squared) * number[0];
-  HeatRadiationAt<T> linear{T(0), amount};  // a flux
-  if (a.term == HeatTerm::convection) linear = {amount, amount * number[1]};
-  if (a.term == HeatTerm::radiation) linear = heat_radiation(amount, a.theta[i], number[1], T(a.reference));
+  const HeatRadiationAt<T> linear =
+      heat_of_term(a.term, normal_of_node(a, i), a.theta[i], number[0], number[1], T(a.reference));
   a.exchange[i] += linear.coefficient;
   a.source[i] += linear.power;
 }

@@ -124,25 +124,33 @@ struct Applied {
       if (a.result[n].pointer) at.store(a.result[n].pointer, a.result[n].stride, out[n]);
   }
 
+  // Calls put(n, ḡ · ∂f/∂n) for the input entries n that are wanted, with the adjoints ḡ of the output entries.
+  template <class V, class Wanted, class Put>
+  MPM_HD static void pull_back(const V (&in)[kIn], const V (&adjoint)[kOut], const Wanted& wanted, const Put& put) {
+    Dual<V> x[kIn], y[kOut];
+    MPM_UNROLL for (int n = 0; n < kIn; n++)
+      x[n] = {in[n], V(0)};
+    for (int n = 0; n < kIn; n++) {
+      if (!wanted(n)) continue;
+      x[n].derivative = V(1);
+      evaluate(x, y);
+      x[n].derivative = V(0);
+      V sum = adjoint[0] * y[0].derivative;
+      MPM_UNROLL for (int k = 1; k < kOut; k++)
+        sum = sum + adjoint[k] * y[k].derivative;
+      put(n, sum);
+    }
+  }
+
   template <class At, class T>
   MPM_HD static void backward_at(const PointwiseBackwardArguments<T, D>& a, const At& at) {
     using V = typename At::Value;
     V in[kIn], adjoint[kOut];
     load(at, a, in);
     load_or_zero(at, a.adjoint, adjoint);
-    Dual<V> x[kIn], y[kOut];
-    MPM_UNROLL for (int n = 0; n < kIn; n++)
-      x[n] = {in[n], V(T(0))};
-    for (int n = 0; n < kIn; n++) {
-      if (!a.gradient[n].pointer) continue;
-      x[n].derivative = V(T(1));
-      evaluate(x, y);
-      x[n].derivative = V(T(0));
-      V sum = adjoint[0] * y[0].derivative;
-      MPM_UNROLL for (int k = 1; k < kOut; k++)
-        sum = sum + adjoint[k] * y[k].derivative;
-      at.store(a.gradient[n].pointer, a.gradient[n].stride, sum);
-    }
+    pull_back(
+        in, adjoint, [&](int n) { return a.gradient[n].pointer != nullptr; },
+        [&](int n, const V& sum) { at.store(a.gradient[n].pointer, a.gradient[n].stride, sum); });
   }
 
   template <class At, class T>

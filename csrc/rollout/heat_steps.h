@@ -10,6 +10,14 @@
 // laws; after G2P, with the positions before it: sums on the nodes, the solve, and the temperature of the particles.
 namespace mpm {
 
+// The node temperatures of a step: the transfer to the nodes, the system, and the results of its solve.
+template <class T, int D>
+struct HeatSolution {
+  HeatToNodesArguments<T, D> down;
+  HeatArguments<T, D> system;
+  const T* theta;  // averages of the nodes [N]
+};
+
 template <class T, int D>
 class HeatSteps {
  public:
@@ -62,6 +70,18 @@ class HeatSteps {
   // Computes the temperatures after a substep, with positions before it and the velocity gradient after it.
   void run(const Field<const T>& x, const Field<const T>& mass, const Field<const T>& rest,
            const Field<const T>& velocity_gradient, const Field<const int>& scene, backend::Stream stream) {
+    const HeatSolution<T, D> solution = conduct(x, mass, rest, velocity_gradient, scene, stream);
+    HeatToParticlesArguments<T, D> up = to_particles(solution.down);
+    backend::heat_to_particles(in_.lattice.order(), up, stream);
+    fields.go(true);
+    if (melts() && MPM_BACKEND == MPM_BACKEND_IS_cpu)
+      find_largest(field<const T>(changing_), scene, rows_of_status() + kLargestFront, kHeatStatusSize, stream);
+  }
+
+  // The part of a substep up to the node temperatures, with the increments of an earlier solve where they are known.
+  HeatSolution<T, D> conduct(const Field<const T>& x, const Field<const T>& mass, const Field<const T>& rest,
+                             const Field<const T>& velocity_gradient, const Field<const int>& scene,
+                             backend::Stream stream, const T* known = nullptr) {
     make_nodes(stream);
     HeatToNodesArguments<T, D> down = to_nodes(x, mass, velocity_gradient);
     backend::heat_to_nodes(in_.lattice.order(), down, stream);
@@ -69,24 +89,50 @@ class HeatSteps {
     means(stream);
     if (has_terms()) add_terms(x, rest, stream);
     HeatArguments<T, D> a = equations(x, stream);
-    if (takes_simple_steps())
+    if (known)
+      use_increments(a, known, stream);
+    else if (takes_simple_steps())
       solve_by_simple_steps(a, stream);
     else
       solve(a, scene, stream);
-    HeatToParticlesArguments<T, D> up = to_particles(down);
-    backend::heat_to_particles(in_.lattice.order(), up, stream);
-    fields.go(true);
-    if (melts() && MPM_BACKEND == MPM_BACKEND_IS_cpu)
-      find_largest(field<const T>(changing_), scene, rows_of_status() + kLargestFront, kHeatStatusSize, stream);
+    return {down, a, static_cast<const T*>(theta_.data_ptr())};
   }
+
+  // The transfer of these temperatures to the particles.
+  HeatToParticlesArguments<T, D> to_particles(const HeatToNodesArguments<T, D>& down);
+
+  // The first columns of the fields, which a call returns and a step reads.
+  int state_columns() const { return volume_; }
+  Tensor state() const {
+    Tensor all = fields.tensor();
+    return torch::stable::narrow(all, 1, 0, volume_);
+  }
+  bool melts() const { return liquid_ >= 0; }
+  // The columns of a tensor in the order of the fields.
+  static Field<T> column_of(const Tensor& t, int first) { return column(field<T>(t), first); }
+  int gradient_column() const { return gradient_; }
+  const Tensor& increments() const { return increment_; }  // of the latest solve [N]
+  // The energy that laws have dissipated in a step, before its `run` [P, 1].
+  Tensor dissipated_energy() const {
+    Tensor all = fields.tensor();
+    return torch::stable::narrow(all, 1, dissipated_, 1);
+  }
+
+  // The terms of the free surface, and heat from inside the matter; and what they read of the particles.
+  bool has_terms() const { return !in_.heat_terms.empty() || has_power() || heats_by_laws(); }
+  std::vector<HeatTermArguments<T, D>> terms() const;
+  HeatSurfaceArguments<T, D> surface(const Field<const T>& x, const Field<const T>& rest) const;
+
+  // The last of the held obstacles is held at its surface, the others at the nodes in them.
+  bool holds_surface() const { return in_.heat_options[2] != 0; }
+  int64_t held_nodes() const { return int64_t(in_.held_obstacles.size()) - holds_surface(); }
+  HeatHoldArguments<T, D> hold(int64_t k, const T* capacity) const;
+  HeatLayersArguments<T, D> layers(const Field<const T>& x, const Field<const int>& scene) const;
+  HeatFromSurfaceArguments<T, D> from_surface() const;
+  const Tensor& exchange_of_particles() const { return exchange_of_particles_; }
 
  private:
   int64_t particles() const { return in_.x.size(0); }
-  bool melts() const { return liquid_ >= 0; }
-  int64_t held_nodes() const { return int64_t(in_.held_obstacles.size()) - holds_surface(); }
-  // The last of the held obstacles is held at its surface, the others at the nodes in them.
-  bool holds_surface() const { return in_.heat_options[2] != 0; }
-  bool has_terms() const { return !in_.heat_terms.empty() || has_power() || heats_by_laws(); }
   // Tensors of the boundaries: held temperatures, numbers of the terms, power of the source; absent ones are empty.
   enum Boundaries : size_t { kHeld, kNumbers, kPower, kBoundaries };
   bool given(Boundaries k) const { return !in_.heat_boundaries.empty() && in_.heat_boundaries[k].numel() > 0; }
@@ -94,8 +140,11 @@ class HeatSteps {
   // The gradient is the last tensor of `heat`.
   bool has_gradient() const { return in_.heat.size() % 3 == 1; }
   bool exchanges() const { return holds_surface() || has_terms(); }
-  // Whether scenes of few simple steps have kernels of their own. Sums on deterministic grids have an order.
-  bool takes_simple_steps() const { return MPM_BACKEND == MPM_BACKEND_IS_cuda && !in_.lattice.deterministic(); }
+  // Whether scenes of few simple steps have kernels of their own. Sums on deterministic grids have an order, and the
+  // adjoint reads the increments of the solver.
+  bool takes_simple_steps() const {
+    return MPM_BACKEND == MPM_BACKEND_IS_cuda && !in_.lattice.deterministic() && in_.resident;
+  }
   double* rows_of_status() const { return static_cast<double*>(status.data_ptr()); }
   const T* held_temperature(int64_t k) const { return temperatures_.pointer + k * temperatures_.stride[0]; }
 
@@ -121,9 +170,9 @@ class HeatSteps {
   int64_t lay_out_cleared(T* memory, int64_t nodes);
   HeatToNodesArguments<T, D> to_nodes(const Field<const T>& x, const Field<const T>& mass,
                                       const Field<const T>& velocity_gradient) const;
-  HeatToParticlesArguments<T, D> to_particles(const HeatToNodesArguments<T, D>& down);
   HeatArguments<T, D> equations(const Field<const T>& x, backend::Stream stream);
   void solve(HeatArguments<T, D>& a, const Field<const int>& scene, backend::Stream stream);
+  void use_increments(const HeatArguments<T, D>& a, const T* increments, backend::Stream stream);
   void solve_by_simple_steps(HeatArguments<T, D>& a, backend::Stream stream);
   void find_largest(const Field<const T>& of, const Field<const int>& scene, double* to, int64_t stride,
                     backend::Stream stream) const;
@@ -151,6 +200,15 @@ class HeatSteps {
   Tensor theta_, capacity_, increment_, iterations_, residual_, converged_, workspace_;
 };
 
+// The adjoint has no laws that expand or melt (torch_mpm/rollouts/fused_heat.py).
+inline void check_heat_has_gradients(const SubstepsInputs& in) {
+  bool parameters_alone = in.laws.find('~') == std::string::npos;
+  for (size_t r = 1; r < in.thermal.size(); r += 3) parameters_alone &= in.thermal[r] >= 0;
+  STD_TORCH_CHECK(parameters_alone,
+                  "heat with laws that expand or melt is computed without gradients: records must be false, and "
+                  "resident true");
+}
+
 template <class T, int D>
 HeatSteps<T, D>::HeatSteps(Substeps<T, D>& steps) : s_(steps), in_(steps.in) {
   const Tensor& x = in_.x;
@@ -158,7 +216,7 @@ HeatSteps<T, D>::HeatSteps(Substeps<T, D>& steps) : s_(steps), in_(steps.in) {
   const size_t tensors = in_.heat.size() - has_gradient();
   STD_TORCH_CHECK(tensors == 3 || tensors == 6, "heat must be 3 or 6 tensors, and the gradient, got ", in_.heat.size());
   STD_TORCH_CHECK(in_.heat_options.size() == 3, "heat_options must have 3 entries, got ", in_.heat_options.size());
-  STD_TORCH_CHECK(in_.heat_scalars.size() == 3, "heat_scalars must have 3 entries, got ", in_.heat_scalars.size());
+  STD_TORCH_CHECK(in_.heat_scalars.size() == 4, "heat_scalars must have 4 entries, got ", in_.heat_scalars.size());
   STD_TORCH_CHECK(in_.heat_scalars[2] >= 0 && in_.heat_scalars[2] <= 1,
                   "the share of plastic heating must be 0 to 1, got ", in_.heat_scalars[2]);
   STD_TORCH_CHECK(in_.heat_boundaries.empty() || in_.heat_boundaries.size() == kBoundaries,
@@ -167,8 +225,9 @@ HeatSteps<T, D>::HeatSteps(Substeps<T, D>& steps) : s_(steps), in_(steps.in) {
                   "the transfer of heat must be 0 to 3, got ", in_.heat_options[0]);
   STD_TORCH_CHECK(in_.heat_options[1] > 0 && in_.heat_options[1] <= INT32_MAX,
                   "the number of iterations must be positive, got ", in_.heat_options[1]);
-  STD_TORCH_CHECK(in_.heat_scalars[0] > 0 && in_.heat_scalars[0] < 1, "the tolerance must be between 0 and 1, got ",
-                  in_.heat_scalars[0]);
+  for (const size_t k : {0, 3})
+    STD_TORCH_CHECK(in_.heat_scalars[k] > 0 && in_.heat_scalars[k] < 1, "the ", k == 0 ? "" : "adjoint ",
+                    "tolerance must be between 0 and 1, got ", in_.heat_scalars[k]);
   STD_TORCH_CHECK(in_.wants_C, "heat needs wants_C");
   STD_TORCH_CHECK(s_.p2g.form == StressForm::mls, "heat needs the stress form mls");
   pack();
@@ -227,11 +286,10 @@ void HeatSteps<T, D>::check_held() {
   if (holds_surface()) exchange_of_particles_ = empty(in_.x, {particles(), 1});
 }
 
-// The layer of particles near the held surface: the rest of their conductance, and their exchange at the nodes.
+// The layer of particles near the held surface.
 template <class T, int D>
-void HeatSteps<T, D>::add_layers(const Field<const T>& x, const Field<const int>& scene, backend::Stream stream) {
+HeatLayersArguments<T, D> HeatSteps<T, D>::layers(const Field<const T>& x, const Field<const int>& scene) const {
   constexpr double kWidth = 2;  // in dx, `WIDTH` of FixedSurface
-  const int64_t k = int64_t(in_.held_obstacles.size()) - 1;
   HeatLayersArguments<T, D> a;
   a.contact = s_.contact;
   a.particles = particles();
@@ -243,7 +301,13 @@ void HeatSteps<T, D>::add_layers(const Field<const T>& x, const Field<const int>
   a.inverse_inertia = in_.lattice.inverse_inertia();
   a.conductance = field<T>(conductance_);
   a.exchange = column(field<T>(exchange_of_particles_), 0);
-  backend::heat_layers(a, stream);
+  return a;
+}
+
+// The rest of the conductance in the layer, and its exchange at the nodes.
+template <class T, int D>
+void HeatSteps<T, D>::add_layers(const Field<const T>& x, const Field<const int>& scene, backend::Stream stream) {
+  backend::heat_layers(layers(x, scene), stream);
   ScatterArguments<T, D> down;
   down.topology = s_.p2g.topology;
   down.x = x;
@@ -255,9 +319,27 @@ void HeatSteps<T, D>::add_layers(const Field<const T>& x, const Field<const int>
 #else
   backend::scatter(in_.lattice.order(), down, stream);
 #endif
-  backend::heat_from_surface(
-      HeatFromSurfaceArguments<T, D>{s_.p2g.topology, held_temperature(k), temperatures_.stride[1], exchange_, source_},
-      stream);
+  backend::heat_from_surface(from_surface(), stream);
+}
+
+// Heat from the held surface.
+template <class T, int D>
+HeatFromSurfaceArguments<T, D> HeatSteps<T, D>::from_surface() const {
+  return {s_.p2g.topology, held_temperature(int64_t(in_.held_obstacles.size()) - 1), temperatures_.stride[1], exchange_,
+          source_};
+}
+
+// The nodes in a held obstacle.
+template <class T, int D>
+HeatHoldArguments<T, D> HeatSteps<T, D>::hold(int64_t k, const T* capacity) const {
+  return {s_.contact,
+          s_.p2g.topology,
+          int(in_.held_obstacles[size_t(k)]),
+          held_temperature(k),
+          temperatures_.stride[1],
+          capacity,
+          static_cast<T*>(start_.data_ptr()),
+          static_cast<bool*>(fixed_.data_ptr())};
 }
 
 // Sets which nodes stay at which temperatures.
@@ -265,11 +347,7 @@ template <class T, int D>
 void HeatSteps<T, D>::hold_nodes(HeatArguments<T, D>& a, backend::Stream stream) {
   T* const start = static_cast<T*>(start_.data_ptr());
   bool* const fixed = static_cast<bool*>(fixed_.data_ptr());
-  for (int64_t k = 0; k < held_nodes(); k++)
-    backend::heat_hold(
-        HeatHoldArguments<T, D>{s_.contact, s_.p2g.topology, int(in_.held_obstacles[size_t(k)]), held_temperature(k),
-                                temperatures_.stride[1], a.heat_capacity, start, fixed},
-        stream);
+  for (int64_t k = 0; k < held_nodes(); k++) backend::heat_hold(hold(k, a.heat_capacity), stream);
   a.theta = start;
   a.fixed = fixed;
 }
@@ -419,24 +497,28 @@ void HeatSteps<T, D>::check_terms() {
   STD_TORCH_CHECK(in_.heat_boundaries[kNumbers].is_contiguous(), "the numbers of heat_terms must be contiguous");
 }
 
-// The terms of the free surface, and the heat from inside the matter.
 template <class T, int D>
-void HeatSteps<T, D>::add_terms(const Field<const T>& x, const Field<const T>& rest, backend::Stream stream) {
-  HeatSurfaceArguments<T, D> down;
-  down.topology = s_.p2g.topology;
-  down.x = x;
-  down.volume = columns().volume;
-  if (has_power()) down.power = value(power_);
+HeatSurfaceArguments<T, D> HeatSteps<T, D>::surface(const Field<const T>& x, const Field<const T>& rest) const {
+  HeatSurfaceArguments<T, D> a;
+  a.topology = s_.p2g.topology;
+  a.x = x;
+  a.volume = columns().volume;
+  if (has_power()) a.power = value(power_);
   if (heats_by_laws()) {
-    down.dissipated = column(fields.now(), dissipated_);
-    down.rest = rest;
-    down.share = in_.heat_scalars[2];
-    down.scene_dt = s_.p2g.scene_dt;
-    down.dt = in_.dt;
+    a.dissipated = column(fields.now(), dissipated_);
+    a.rest = rest;
+    a.share = in_.heat_scalars[2];
+    a.scene_dt = s_.p2g.scene_dt;
+    a.dt = in_.dt;
   }
-  down.deterministic = in_.lattice.deterministic();
-  down.sums = {surface_, kHeatChannels, kHeatChannels};
-  backend::heat_surface(in_.lattice.order(), down, stream);
+  a.deterministic = in_.lattice.deterministic();
+  a.sums = {surface_, kHeatChannels, kHeatChannels};
+  return a;
+}
+
+template <class T, int D>
+std::vector<HeatTermArguments<T, D>> HeatSteps<T, D>::terms() const {
+  std::vector<HeatTermArguments<T, D>> list;
   HeatTermArguments<T, D> a;
   a.topology = s_.p2g.topology;
   a.sums = surface_;
@@ -447,10 +529,17 @@ void HeatSteps<T, D>::add_terms(const Field<const T>& x, const Field<const T>& r
   for (size_t k = 0; k < in_.heat_terms.size(); k++) {
     a.term = HeatTerm(in_.heat_terms[k]);
     a.number = static_cast<const T*>(in_.heat_boundaries[kNumbers].data_ptr()) + 2 * int64_t(k) * in_.scenes;
-    backend::heat_add_term(a, stream);
+    list.push_back(a);
   }
   a.term = HeatTerm::power;
-  if (has_power() || heats_by_laws()) backend::heat_add_term(a, stream);
+  if (has_power() || heats_by_laws()) list.push_back(a);
+  return list;
+}
+
+template <class T, int D>
+void HeatSteps<T, D>::add_terms(const Field<const T>& x, const Field<const T>& rest, backend::Stream stream) {
+  backend::heat_surface(in_.lattice.order(), surface(x, rest), stream);
+  for (const HeatTermArguments<T, D>& term : terms()) backend::heat_add_term(term, stream);
 }
 
 // The equations of the temperatures of the nodes.
@@ -490,15 +579,22 @@ template <class T, int D>
 void HeatSteps<T, D>::solve(HeatArguments<T, D>& a, const Field<const int>& scene, backend::Stream stream) {
   if (MPM_BACKEND == MPM_BACKEND_IS_cpu) find_largest(field<const T>(number_), scene, largest_, 1, stream);
   backend::heat_cg(in_.lattice.order(), a, stream);
-  backend::heat_increments(HeatIncrementsArguments<T, D>{slots_ * kBlockNodes<D>, a.increment, a.theta,
-                                                         field<const T>(theta_).pointer, sums_},
-                           stream);
+  use_increments(a, a.increment, stream);
   backend::heat_count(
       HeatCountArguments<T, D>{in_.scenes, a.converged, a.residual, s_.p2g.scene_dt.pointer, rows_of_status()}, stream);
 }
 
-// The same, on CUDA, where scenes of simple steps have kernels of their own. These allow particles that have left their
-// base blocks. The solver of the other scenes does not, so an activation is requested where a scene may soon be one.
+// Uses the increments of a solve.
+template <class T, int D>
+void HeatSteps<T, D>::use_increments(const HeatArguments<T, D>& a, const T* increments, backend::Stream stream) {
+  backend::heat_increments(HeatIncrementsArguments<T, D>{slots_ * kBlockNodes<D>, increments, a.theta,
+                                                         field<const T>(theta_).pointer, sums_},
+                           stream);
+}
+
+// Solves the equations on CUDA, where scenes of simple steps have kernels of their own. These allow particles that have
+// left their base blocks. The solver of the other scenes does not, so an activation is requested where a scene may soon
+// be one.
 template <class T, int D>
 void HeatSteps<T, D>::solve_by_simple_steps([[maybe_unused]] HeatArguments<T, D>& a,
                                             [[maybe_unused]] backend::Stream stream) {

@@ -26,12 +26,13 @@ MPM_BACKEND_KERNELS(MPM_ROLLOUT_KERNELS)
   PLAIN(longest_move, LongestMoveArguments)          \
   PLAIN(permute, PermuteArguments)
 MPM_BACKEND_KERNELS(MPM_SORTED_CPU_KERNELS)
-#else
+#endif
+
 #define MPM_THERMAL_LAWS_KERNELS(PLAIN, ORDERED, SIZE) \
   PLAIN(begin_thermal_laws, ThermalLawsArguments)      \
-  PLAIN(end_thermal_laws, ThermalLawsArguments)
+  PLAIN(end_thermal_laws, ThermalLawsArguments)        \
+  PLAIN(thermal_laws_backward, ThermalLawsBackwardArguments)
 MPM_BACKEND_KERNELS(MPM_THERMAL_LAWS_KERNELS)
-#endif
 
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda
 namespace mpm::cuda {

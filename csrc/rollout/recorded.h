@@ -1,10 +1,12 @@
 #pragma once
 
 #include "common/signals.h"
+#include "rollout/heat_steps.h"
 #include "rollout/step_kernels.h"
+#include "rollout/thermal_laws.op.h"
 
-// n steps with a record of the inputs of their adjoints: the particles of each step, and its active blocks and nodes if
-// these need less memory than the particles.
+// n steps with a record of the inputs of their adjoints: the particles of each step with their heat, and its active
+// blocks and nodes if these need less memory than the particles.
 namespace mpm {
 
 // Consecutive pieces of one tensor of bytes; without a tensor the bytes are only counted.
@@ -84,8 +86,12 @@ template <class T, int D>
 class Recorded {
  public:
   Substeps<T, D> steps;
+  std::optional<HeatSteps<T, D>> heat;
+  std::optional<ThermalLaws<T, D>> thermal;
   Record<T> x, v, C, F, J, residual, history, stress;
-  Record<T> mapped;  // F after the return maps
+  Record<T> mapped;      // F after the return maps
+  Record<T> heat_after;  // temperature, gradient and liquid fraction
+  Record<T> dissipated;  // energy that laws have turned into heat
 
   // In `memory`, filled by an earlier `run`, or in new memory.
   Recorded(const SubstepsInputs& in, const OptionalTensor& memory, backend::Stream stream);
@@ -96,6 +102,23 @@ class Recorded {
   // Restores the state after the grid update of step i, which is the last step, or precedes the step of the last call.
   // False as for `run`.
   bool return_to(int64_t i);
+
+  Field<const int> scene_of_particles() const { return {steps.activation.scene, {steps.activation.scene_stride}}; }
+
+  // Computes the node temperatures of that step again.
+  HeatSolution<T, D> conduct_again(int64_t i) {
+    Tensor before = heat->state();
+    torch::stable::copy_(before, i == 0 ? first_heat_ : heat_after.vector(i - 1));
+    heat->begin(state(i).F, state(i).J, steps.p2g.volume, stream_);
+    if (heat->heats_by_laws()) {
+      Tensor energy = heat->dissipated_energy();
+      torch::stable::copy_(energy, dissipated.vector(i));
+    }
+    const T* const known =
+        keeps_grids_ ? static_cast<const T*>(torch::stable::select(increments_, 0, i).data_ptr()) : nullptr;
+    return heat->conduct(state(i).x, steps.p2g.mass, steps.p2g.volume, constant(C[i]), scene_of_particles(), stream_,
+                         known);
+  }
 
   // The whole record in one tensor; undefined if a pool has outgrown it.
   Tensor memory() const { return steps.activation.max_blocks == in_.max_blocks ? memory_ : Tensor(); }
@@ -159,6 +182,24 @@ class Recorded {
     if (scene_times_.defined()) steps.contact.scene_time = scene_time(i);
   }
 
+  void begin_heat(int64_t i) {
+    heat->begin(state(i).F, state(i).J, steps.p2g.volume, stream_);
+    if (heat->heats_by_laws()) steps.dissipate(heat->dissipated());
+  }
+
+  void conduct_heat(int64_t i) {
+    if (heat->heats_by_laws()) {
+      Tensor energy = dissipated.vector(i);
+      torch::stable::copy_(energy, heat->dissipated_energy());
+    }
+    heat->run(state(i).x, steps.p2g.mass, steps.p2g.volume, constant(C[i]), scene_of_particles(), stream_);
+    Tensor to = heat_after.vector(i);
+    torch::stable::copy_(to, heat->state());
+    if (!keeps_grids_) return;
+    Tensor increments = torch::stable::select(increments_, 0, i);
+    torch::stable::copy_(increments, heat->increments());
+  }
+
   bool activate(int64_t i) { return steps.activate(i == 0 && !goes_on_ ? nullptr : status(i - 1), status(i), stream_); }
 
   // Copies the fields that a law of a mixture writes only for its own particles.
@@ -188,7 +229,7 @@ class Recorded {
 
   const SubstepsInputs& in_;
   backend::Stream stream_;
-  Tensor first_history_, memory_, workspace_, scene_times_;
+  Tensor first_history_, first_heat_, memory_, workspace_, scene_times_;
   Particles<const T> first_;
   std::vector<double> time_;
   const ObstacleRow<T, D>* first_row_;
@@ -196,7 +237,7 @@ class Recorded {
   bool keeps_grids_ = false, taken_ = false;
   Arena grids_;  // begins at the first step
   int64_t grid_size_ = 0;
-  Tensor nodes_;  // of all grids
+  Tensor nodes_, increments_;  // of all grids; the latter of heat
   int* status_ = nullptr;
 };
 
@@ -211,6 +252,12 @@ Recorded<T, D>::Recorded(const SubstepsInputs& in, const OptionalTensor& memory,
   while (int64_t(time_.size()) < in.n) time_.push_back(time_.back() + in.dt);
   first_history_ = packed_history(in.x, in.history, steps.columns);
   first_ = given_particles<T, D>(in, first_history_);
+  if (HeatSteps<T, D>::wanted(in)) {
+    heat.emplace(steps);
+    first_heat_ = copy_of(heat->state());
+  }
+  if (ThermalLaws<T, D>::wanted(steps)) thermal.emplace(steps, heat ? &*heat : nullptr);
+  steps.laws_are_apart = thermal || (heat && heat->heats_by_laws());
   steps.forget_stress();  // each step has its own stress
   steps.fuse(true);
   steps.activation.workspace_size = backend::activate_workspace(steps.activation, stream);
@@ -218,6 +265,7 @@ Recorded<T, D>::Recorded(const SubstepsInputs& in, const OptionalTensor& memory,
   grid_in(one, {});
   grid_size_ = one.size();
   one.template tensor<T>(in.x, Pool<T, D>::nodes_shape(steps.activation), in.x.scalar_type());
+  if (heat) one.template tensor<T>(in.x, {int64_t(steps.activation.slots()) * kBlockNodes<D>}, in.x.scalar_type());
   // At most half of the memory of the particles; torch_mpm/rollouts/budget.py relies on it.
   keeps_grids_ = 2 * one.size() <= in.x.size(0) * (2 * D + 4 * D * D) * int64_t(sizeof(T));
   lay_out(counted);
@@ -259,10 +307,13 @@ void Recorded<T, D>::lay_out(Arena& arena) {
   if (steps.columns > 0) history = Record<T>(arena, given, n, steps.columns);
   stress = Record<T>(arena, given, n, D, D);
   if (steps.plastic) mapped = Record<T>(arena, given, n, D, D);
+  if (heat) heat_after = Record<T>(arena, given, n, heat->state_columns());
+  if (heat && heat->heats_by_laws()) dissipated = Record<T>(arena, given, n);
   status_ = arena.take<int>((1 + n) * (1 + in_.scenes) * kStatusSize);
   if (!keeps_grids_) return;
   const Shape nodes = Pool<T, D>::nodes_shape(steps.activation);
   nodes_ = arena.tensor<T>(given, {n, nodes[0], nodes[1]}, given.scalar_type());
+  if (heat) increments_ = arena.tensor<T>(given, {n, nodes[0]}, given.scalar_type());
   grids_ = arena;
   arena.skip(n * grid_size_);
 }
@@ -292,8 +343,11 @@ bool Recorded<T, D>::run() {
     if (!memory().defined()) keeps_grids_ = steps.nodes_are_clear = false;  // all steps share the grown pool
     steps.write({x[i], v[i], C[i], F[i], J[i], residual[i], history[i]});
     if (has(in_.material)) keep_others(i);
-    steps.run_laws(stream_);
+    if (heat) begin_heat(i);
+    if (thermal) thermal->read({}, {});
+    thermal ? thermal->run(stream_) : steps.run_laws(stream_);
     steps.move(stream_);
+    if (heat) conduct_heat(i);
     steps.end_time(stream_);
     after_substeps(in_.x.size(0), 1, stream_);
   }

@@ -178,6 +178,7 @@ struct Substeps {
   // second P2G and gather use the blocks of the activation only.
   void let_activations_last(backend::Stream stream) {
     if (MPM_BACKEND == MPM_BACKEND_IS_cpu || (in.lattice.deterministic() && !sums_are_fixed(facts)) || flips()) return;
+    if (!in.heat.empty() && !in.resident) return;  // the solver of heat needs all particles in their base blocks
     if (sums_are_fixed(facts)) fix_sums(stream);
     displacements = empty_int(in.x, {2, sizeof(Displacement) / sizeof(int)});
     torch::stable::zero_(displacements);
@@ -248,8 +249,9 @@ struct Substeps {
   // Sets where laws store the energy that they dissipate, [P].
   void dissipate(const Field<T>& to) {
     for (size_t k = 0; k < laws.size(); k++)
-      if (calls[k].law->info.plastic || !calls[k].history.empty()) laws[k].dissipated = to;
+      if (dissipates(k)) laws[k].dissipated = to;
   }
+  bool dissipates(size_t k) const { return calls[k].law->info.plastic || !calls[k].history.empty(); }
 
   // Computes the stress, if P2G does not.
   void run_laws(backend::Stream stream) {

@@ -44,8 +44,8 @@ std::optional<Results> run_recorded(const SubstepsInputs& in, backend::Stream st
                  absent(),
                  has(in.scene_time) ? r.scene_time_after() : absent(),
                  copy(has(in.residual), r.residual, &R::vector),
-                 absent(),
-                 absent(),
+                 r.heat ? r.heat->state() : absent(),
+                 r.heat ? r.heat->status : absent(),
                  r.memory()};
 }
 
@@ -71,7 +71,7 @@ Results no_step(const SubstepsInputs& in, const SortedCpu<T, D>& particles, cons
           impulse,
           time,
           copy(in.residual, has(in.residual), {P, D}),
-          particles.heat ? particles.heat->fields.tensor() : absent(),
+          particles.heat ? particles.heat->state() : absent(),
           particles.heat ? particles.heat->status : absent(),
           absent()};
 }
@@ -112,7 +112,7 @@ Results run_steps(const SubstepsInputs& in, backend::Stream stream) {
           impulse,
           time,
           particles.residual.tensor(),
-          particles.heat ? particles.heat->fields.tensor() : absent(),
+          particles.heat ? particles.heat->state() : absent(),
           particles.heat ? particles.heat->status : absent(),
           absent()};
 }
@@ -133,8 +133,7 @@ Results run_steps(const SubstepsInputs& in, backend::Stream stream) {
 Results run(const SubstepsInputs& in) {
   const Tensor& x = in.x;
   check_positions(x);
-  STD_TORCH_CHECK(in.heat.empty() || (!in.records && in.resident),
-                  "heat is computed without gradients: records must be false, and resident true");
+  if (in.records || !in.resident) check_heat_has_gradients(in);
   const DeviceScope device(x);
   std::optional<Results> results;
   if (in.records && !has(in.impulse) && x.size(0) > 0)

@@ -1,4 +1,5 @@
 #include "common/team.h"
+#include "rollout/heat_backward.h"
 #include "rollout/recorded.h"
 
 // The adjoint of n steps in one call. The steps are recomputed with a record of the inputs of each, unless the forward
@@ -11,12 +12,24 @@ namespace {
 // Adjoints per particle; absent ones are undefined.
 struct Adjoints {
   Tensor x, v, C, F, J, history, mass, volume;
-  Tensor parameters;  // [P, n], of all laws
-  Tensor dt;          // [P], with respect to dt * scene_dt, without gravity
+  Tensor parameters;             // [P, n], of all laws
+  Tensor dt;                     // [P], with respect to dt * scene_dt, without gravity
+  Tensor heat, heat_parameters;  // [P, m] in the order of the result, [P, kHeatParameters]
+  Tensor heat_boundaries;        // [B, m], see HeatAdjoints
+  Tensor heat_status;            // of the adjoint solves
 };
 
 // Bits of `needs`, in the order of the returned tensors after those of the state.
-enum Need : int64_t { kMass = 1, kVolume = 2, kParameters_ = 4, kGravity = 8, kObstacles = 16, kTimeStep = 32 };
+enum Need : int64_t {
+  kMass = 1,
+  kVolume = 2,
+  kParameters_ = 4,
+  kGravity = 8,
+  kObstacles = 16,
+  kTimeStep = 32,
+  kHeatParameters_ = 64,
+  kHeatBoundaries = 128
+};
 
 // Adjoints summed over the grid, undefined if not wanted: of gravity, by blocks of the domain, and of the table of
 // obstacles.
@@ -33,6 +46,9 @@ class SubstepsBackward {
 
   int64_t columns() const { return s_.columns; }  // of the history of all laws
   int64_t blocks() const { return s_.update.block_count; }
+  // Laws of temperature pass the adjoints of their parameters on.
+  bool wants_parameters(int64_t needs) const { return (needs & kParameters_) || r_.thermal; }
+  int64_t heat_columns() const { return r_.heat ? r_.heat->state_columns() : 0; }
 
   // The adjoints of the final state become those of the initial state; the others are accumulated.
   void run(Adjoints& adjoints, const GridSums& sums) {
@@ -45,19 +61,31 @@ class SubstepsBackward {
     if (sums.gravity.defined()) change_ = empty(in_.x, {slots, D});
     if (sums.obstacles.defined()) row_grad_ = empty(in_.x, {slots, s_.contact.obstacles, ObstacleRow<T, D>::width});
     if (s_.flips()) before_ = empty(in_.x, {3, rows, 1 + D});
+    std::optional<HeatBackward<T, D>> heat;
+    if (r_.heat) heat.emplace(r_, in_, stream_);
     for (int64_t i = in_.n - 1; i >= 0; i--) {
       check_room(r_.return_to(i));
       if (s_.flips()) keep_adjoint(adjoints);
+      if (heat) heat->run(i, heat_adjoints(adjoints));
       backward_advance(i, adjoints);
       backward_grid(i, adjoints, sums);
       if (s_.flips()) backward_kept(adjoints);
-      backward_laws(adjoints);
+      if (r_.thermal) r_.thermal->read({}, {}), r_.thermal->begin(stream_);
+      backward_laws(adjoints, heat ? heat->dissipated : absent());
+      if (r_.thermal)
+        r_.thermal->backward(field<T>(adjoints.parameters), HeatSteps<T, D>::column_of(adjoints.heat, 0), stream_);
+      if (heat) add_terms({{adjoints.x, heat->x_term}, {adjoints.F, heat->F_term}, {adjoints.J, heat->J_term}});
       if (adjoints.dt.defined()) add_terms({{adjoints.dt, motion_dt_}, {adjoints.dt, stress_dt_}});
       after_substeps(in_.x.size(0), 1, stream_);
     }
   }
 
  private:
+  // Those of the heat of a step, which adds to the adjoint of the velocity gradient after the step.
+  static HeatAdjoints heat_adjoints(const Adjoints& a) {
+    return {a.heat, a.heat_parameters, a.C, a.mass, a.volume, a.dt, a.heat_boundaries, a.heat_status};
+  }
+
   // The adjoints of the motion of the nodes in a step.
   T* motion_of(int64_t i) const { return static_cast<T*>(motion_.data_ptr()) + i % motions_ * motion_.stride(0); }
 
@@ -73,7 +101,7 @@ class SubstepsBackward {
   void backward_obstacles(int64_t i, const T* nodes, const GridSums& sums);
   void keep_adjoint(const Adjoints& adjoints);
   void backward_kept(Adjoints& adjoints);
-  void backward_laws(Adjoints& adjoints);
+  void backward_laws(Adjoints& adjoints, const Tensor& dissipated);
 
   // Adds to each sum its term of the same strides, if there is one.
   void add_terms(std::initializer_list<std::pair<Tensor, Tensor>> sums) {
@@ -147,7 +175,7 @@ void SubstepsBackward<T, D>::make_terms(int64_t needs) {
     changing |= info.changes();
   }
   F_term_ = result(x, history, {P, D, D});
-  parameters_term_ = result(x, changing && (needs & kParameters_), {P, int64_t(in_.parameters.size())});
+  parameters_term_ = result(x, changing && wants_parameters(needs), {P, int64_t(in_.parameters.size())});
   for (Tensor* term : {&F_term_, &parameters_term_})  // zero for the particles of other laws
     if (term->defined()) torch::stable::zero_(*term);
 }
@@ -330,9 +358,10 @@ void SubstepsBackward<T, D>::backward_kept(Adjoints& adjoints) {
 }
 
 // Adjoint of the laws, the last one first: from F after the laws, stress and history to F and history before. A law
-// updates the adjoints of the quantities that it maps in place, and adds to those that it only reads.
+// updates the adjoints of the quantities that it maps in place, and adds to those that it only reads. `dissipated` is
+// the adjoint of the energy that becomes heat, or undefined.
 template <class T, int D>
-void SubstepsBackward<T, D>::backward_laws(Adjoints& adjoints) {
+void SubstepsBackward<T, D>::backward_laws(Adjoints& adjoints, const Tensor& dissipated) {
   int64_t parameter = int64_t(in_.parameters.size());
   for (size_t k = s_.calls.size(); k-- > 0;) {
     const LawCall& call = s_.calls[k];
@@ -346,6 +375,7 @@ void SubstepsBackward<T, D>::backward_laws(Adjoints& adjoints) {
                        : info.plastic || a.adds                ? adjoints.F
                                                                : F_term_);
     if (info.viscous) a.C = field<T>(adjoints.C);
+    if (s_.dissipates(k)) a.grad_dissipated = field<const T>(dissipated);
     if (!call.history.empty()) {
       a.grad_history = variable<const T, D>(field<const T>(adjoints.history), call.first_column, false);
       a.history = variable<T, D>(field<T>(adjoints.history), call.first_column, false);
@@ -371,21 +401,26 @@ void set(Tensor& adjoint, const OptionalTensor& grad, const char* name, const Te
   torch::stable::copy_(adjoint, *grad);
 }
 
-using Gradients =
-    std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
+using Gradients = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor,
+                             Tensor, Tensor, Tensor, Tensor, Tensor>;
 
-Gradients substeps_backward(const OptionalTensor& grad_x, const OptionalTensor& grad_v, const OptionalTensor& grad_C,
-                            const OptionalTensor& grad_F, const OptionalTensor& grad_J,
-                            const OptionalTensor& grad_history, const OptionalTensor& grad_impulse, int64_t needs,
-                            const OptionalTensor& record, MPM_SUBSTEPS_PARAMETERS) {
+// The list of the adjoints of the results. An op has at most 64 arguments, the bits of the dispatcher.
+enum Result : size_t { kX, kV, kC, kF, kJ, kHistory, kImpulse, kHeat, kResults };
+
+Gradients substeps_backward(const std::vector<OptionalTensor>& grads, int64_t needs, const OptionalTensor& record,
+                            MPM_SUBSTEPS_PARAMETERS) {
   const SubstepsInputs in{MPM_SUBSTEPS_ARGUMENTS};
   check_positions(x);
+  check_heat_has_gradients(in);
+  const bool holds_surface = in.heat_options.size() > 2 && in.heat_options[2] != 0;
+  STD_TORCH_CHECK(!holds_surface || !(needs & kObstacles), "obstacles have no gradients where heat holds a surface");
+  STD_TORCH_CHECK(grads.size() == kResults, "grads must have ", size_t(kResults), " entries, got ", grads.size());
   const int64_t P = x.size(0);
   Adjoints adjoints;
   GridSums sums;
   const DeviceScope device(x);
   dispatch(x, [&]<class T, int D>() {
-    SubstepsBackward<T, D> backward(in, grad_impulse, record, needs, device.stream());
+    SubstepsBackward<T, D> backward(in, grads[kImpulse], record, needs, device.stream());
     adjoints.x = empty_particles(x, {P, D});
     adjoints.v = empty_particles(x, {P, D});
     adjoints.C = empty_particles(x, {P, D, D});
@@ -394,22 +429,48 @@ Gradients substeps_backward(const OptionalTensor& grad_x, const OptionalTensor& 
     adjoints.history = result(x, backward.columns() > 0, {P, backward.columns()});
     adjoints.mass = result(x, needs & kMass, {P});
     adjoints.volume = result(x, needs & kVolume, {P});
-    adjoints.parameters = result(x, needs & kParameters_, {P, int64_t(parameters.size())});
+    adjoints.parameters = result(x, backward.wants_parameters(needs), {P, int64_t(parameters.size())});
     adjoints.dt = result(x, needs & kTimeStep, {P});
-    set(adjoints.x, grad_x, "grad_x", x);
-    set(adjoints.v, grad_v, "grad_v", x);
-    set(adjoints.C, grad_C, "grad_C", x);
-    set(adjoints.F, grad_F, "grad_F", x);
-    set(adjoints.J, grad_J, "grad_J", x);
-    set(adjoints.history, grad_history, "grad_history", x);
-    for (Tensor* sum : {&adjoints.mass, &adjoints.volume, &adjoints.parameters, &adjoints.dt}) set(*sum, {}, "", x);
+    if (const int64_t columns = backward.heat_columns(); columns > 0) {
+      adjoints.heat = empty_particles(x, {P, columns});
+      adjoints.heat_parameters = result(x, needs & kHeatParameters_, {P, int64_t(kHeatParameters)});
+      const int64_t numbers = 2 * int64_t(in.heat_terms.size()) + int64_t(in.held_obstacles.size());
+      if ((needs & kHeatBoundaries) && numbers > 0) adjoints.heat_boundaries = zeros(x, {in.scenes, numbers});
+      adjoints.heat_status = empty(x, {in.scenes, int64_t(kHeatStatusSize)}, ScalarType::Double);
+      torch::stable::zero_(adjoints.heat_status);
+    }
+    set(adjoints.x, grads[kX], "grad_x", x);
+    set(adjoints.v, grads[kV], "grad_v", x);
+    set(adjoints.C, grads[kC], "grad_C", x);
+    set(adjoints.F, grads[kF], "grad_F", x);
+    set(adjoints.J, grads[kJ], "grad_J", x);
+    set(adjoints.history, grads[kHistory], "grad_history", x);
+    set(adjoints.heat, grads[kHeat], "grad_heat", x);
+    for (Tensor* sum :
+         {&adjoints.mass, &adjoints.volume, &adjoints.parameters, &adjoints.dt, &adjoints.heat_parameters})
+      set(*sum, {}, "", x);
     if ((needs & kGravity) && has(gravity)) sums.gravity = zeros(x, {backward.blocks(), D});
     if ((needs & kObstacles) && has(obstacle_table)) sums.obstacles = zeros(x, sizes_of(*obstacle_table));
     if (P > 0) with_team(P * n, [&] { backward.run(adjoints, sums); });
   });
   if (!has(C)) adjoints.C = Tensor();
-  return {adjoints.x,    adjoints.v,      adjoints.C,          adjoints.F,   adjoints.J,     adjoints.history,
-          adjoints.mass, adjoints.volume, adjoints.parameters, sums.gravity, sums.obstacles, adjoints.dt};
+  if (!(needs & kParameters_)) adjoints.parameters = Tensor();
+  return {adjoints.x,
+          adjoints.v,
+          adjoints.C,
+          adjoints.F,
+          adjoints.J,
+          adjoints.history,
+          adjoints.mass,
+          adjoints.volume,
+          adjoints.parameters,
+          sums.gravity,
+          sums.obstacles,
+          adjoints.dt,
+          adjoints.heat,
+          adjoints.heat_parameters,
+          adjoints.heat_boundaries,
+          adjoints.heat_status};
 }
 
 }  // namespace
@@ -417,11 +478,10 @@ Gradients substeps_backward(const OptionalTensor& grad_x, const OptionalTensor& 
 
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
 STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
-  m.def(
-      "substeps_backward(Tensor? grad_x, Tensor? grad_v, Tensor? grad_C, Tensor? grad_F, Tensor? grad_J, "
-      "Tensor? grad_history, Tensor? grad_impulse, int needs, Tensor? record, " MPM_SUBSTEPS_SCHEMA
-      ") -> (Tensor x, Tensor v, Tensor C, Tensor F, Tensor J, Tensor history, Tensor mass, Tensor volume, "
-      "Tensor parameters, Tensor gravity, Tensor obstacles, Tensor dt)");
+  m.def("substeps_backward(Tensor?[] grads, int needs, Tensor? record, " MPM_SUBSTEPS_SCHEMA
+        ") -> (Tensor x, Tensor v, Tensor C, Tensor F, Tensor J, Tensor history, Tensor mass, Tensor volume, "
+        "Tensor parameters, Tensor gravity, Tensor obstacles, Tensor dt, Tensor heat, Tensor heat_parameters, Tensor "
+        "heat_boundaries, Tensor heat_status)");
 }
 #endif
 

@@ -16,7 +16,13 @@ void end_thermal_laws(const ThermalLawsArguments<T, D>& a, Stream stream) {
   for_each<end_laws_of<T, D>>(a.particles, a, stream);
 }
 
+template <class T, int D>
+void thermal_laws_backward(const ThermalLawsBackwardArguments<T, D>& a, Stream stream) {
+  for_each<laws_of_backward<T, D>>(a.forward.particles, a, stream);
+}
+
 MPM_INSTANTIATE(begin_thermal_laws, ThermalLawsArguments)
 MPM_INSTANTIATE(end_thermal_laws, ThermalLawsArguments)
+MPM_INSTANTIATE(thermal_laws_backward, ThermalLawsBackwardArguments)
 
 }  // namespace mpm::cuda

@@ -46,16 +46,41 @@ struct ThermalLawsArguments {
   MPM_HD bool ends() const { return next_F.pointer || next_J.pointer || liquid_stress.pointer; }
 };
 
+// Adjoint of the parameters by tables: those of a material, whose columns of the adjoints of all parameters become
+// zero.
+template <class T, int D>
+struct ThermalLawsBackwardArguments {
+  ThermalLawsArguments<T, D> forward;
+  int column[2 * kMostParameters] = {};  // of each parameter in those of all laws
+  Field<T> parameters;                   // [P, n]
+  Field<T> theta;                        // [P], added
+};
+
 inline namespace TORCH_MPM_ISA {
 
-template <class T>
-MPM_HD T value_at(const TemperatureTable<T>& table, const T& theta) {
+// At a temperature of any scalar.
+template <class S, class T>
+MPM_HD S value_at(const TemperatureTable<T>& table, const S& theta) {
   int left = 0;
-  while (left + 2 < table.knots && theta > table.temperature[left + 1]) left++;
-  if (table.knots == 1) return table.value[0];
+  while (left + 2 < table.knots && theta > lift<S>(table.temperature[left + 1])) left++;
+  if (table.knots == 1) return lift<S>(table.value[0]);
   const T* const knot = table.temperature + left;
-  const T share = clamp_to_unit((theta - knot[0]) / (knot[1] - knot[0]));
-  return table.value[left] + share * (table.value[left + 1] - table.value[left]);
+  const S share = clamp_to_unit((theta - lift<S>(knot[0])) / lift<S>(knot[1] - knot[0]));
+  return lift<S>(table.value[left]) + share * lift<S>(table.value[left + 1] - table.value[left]);
+}
+
+template <class T, int D>
+MPM_HD void laws_of_backward(const ThermalLawsBackwardArguments<T, D>& a, int64_t p) {
+  if (!a.forward.members.has(p)) return;
+  const One<T> at{p};
+  const Dual<T> theta(load_scalar(at, a.forward.theta), T(1));
+  T sum = load_scalar(at, constant(a.theta));
+  for (int k = 0; k < a.forward.parameter_count; k++) {
+    T& adjoint = a.parameters.pointer[p * a.parameters.stride[0] + a.column[k] * a.parameters.stride[1]];
+    sum += value_at(a.forward.parameters[k].table, theta).derivative * adjoint;
+    adjoint = T(0);
+  }
+  store_scalar(at, a.theta, sum);
 }
 
 template <class T, int D>

@@ -3,7 +3,8 @@
 #include "rollout/heat_steps.h"
 #include "rollout/thermal_laws.h"
 
-// Laws of temperature in a call of many substeps: their tables, and on CUDA their buffers and kernels.
+// Laws of temperature in a call of many substeps: their tables, and where laws are computed kernel by kernel their
+// buffers and kernels.
 namespace mpm {
 
 // What a table gives in the place of the number of a parameter: the expansion of a material, the coherency of a liquid.
@@ -51,8 +52,6 @@ std::vector<LawTemperature<T>> temperatures_of_laws(const SubstepsInputs& in, co
   return laws;
 }
 
-#if MPM_BACKEND == MPM_BACKEND_IS_cuda
-
 // The laws of a call kernel by kernel, with buffers for what they read in place of the fields of the particles.
 template <class T, int D>
 class ThermalLaws {
@@ -64,13 +63,19 @@ class ThermalLaws {
     const int64_t P = s_.in.x.size(0);
     const std::vector<LawTemperature<T>> laws = temperatures_of_laws<T>(s_.in, s_.calls);
     materials_.resize(laws.size());
+    columns_.resize(laws.size());
+    int first = 0;
     for (size_t k = 0; k < laws.size(); k++) {
       const bool melts = s_.calls[k].melts;
       ThermalLawsArguments<T, D>& a = materials_[melts ? k - 1 : k];
       a.particles = P;
       a.members = s_.laws[k].law.members;
       for (int i = 0; i < kMostParameters; i++)
-        if (laws[k].parameters[i].knots > 0) add_parameter(a, s_.laws[k].law.parameters[i], laws[k].parameters[i]);
+        if (laws[k].parameters[i].knots > 0) {
+          columns_[melts ? k - 1 : k].push_back(first + i);
+          add_parameter(a, s_.laws[k].law.parameters[i], laws[k].parameters[i]);
+        }
+      first += int(s_.calls[k].parameters.size());
       if (!melts) a.expansion = laws[k].expansion;
       if (melts) a.coherency = laws[k].coherency;
     }
@@ -91,6 +96,25 @@ class ThermalLaws {
       if (has_liquid(k)) a.next_J = J;
       read_elastic(k, a);
       if (has_liquid(k)) read_elastic(k + 1, a);
+    }
+  }
+
+  // Computes the parameters by tables at the present temperatures.
+  void begin(backend::Stream stream) const {
+    for (const ThermalLawsArguments<T, D>& a : materials_)
+      if (a.begins()) backend::begin_thermal_laws(a, stream);
+  }
+
+  // Passes the adjoints of the parameters by tables in those of all laws [P, n] to the temperature.
+  void backward(const Field<T>& parameters, const Field<T>& theta, backend::Stream stream) const {
+    for (size_t k = 0; k < materials_.size(); k++) {
+      if (columns_[k].empty()) continue;
+      ThermalLawsBackwardArguments<T, D> a;
+      a.forward = materials_[k];
+      std::copy(columns_[k].begin(), columns_[k].end(), a.column);
+      a.parameters = parameters;
+      a.theta = theta;
+      backend::thermal_laws_backward(a, stream);
     }
   }
 
@@ -141,9 +165,8 @@ class ThermalLaws {
   Substeps<T, D>& s_;
   const HeatSteps<T, D>* const heat_;
   std::vector<ThermalLawsArguments<T, D>> materials_;  // with their first law
+  std::vector<std::vector<int>> columns_;              // of their parameters by tables in those of all laws
   Tensors buffers_;
 };
-
-#endif
 
 }  // namespace mpm

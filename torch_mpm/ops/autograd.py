@@ -69,7 +69,8 @@ def register_autograd(
         setup: function (ctx, inputs, output), or None where backward needs nothing.
     """
     op = getattr(torch.ops.torch_mpm, name).default
-    lists = [i for i, a in enumerate(op._schema.arguments) if str(a.type) == "List[Tensor]" and a.name != "topology"]
+    kinds = ("List[Tensor]", "List[Optional[Tensor]]")
+    lists = [i for i, a in enumerate(op._schema.arguments) if str(a.type) in kinds and a.name != "topology"]
     defaults = tuple(a.default_value for a in op._schema.arguments)  # of trailing arguments, which torch omits
 
     def forward(ctx: Any, lengths: list[int], *flat: Any) -> Any:

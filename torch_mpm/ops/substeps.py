@@ -26,18 +26,19 @@ With `records` all inputs of the adjoint are stored in `record`, opaque bytes, a
 impulses are counted or the pool had to grow. `residual` is `State.x_residual`; without it positions are not
 compensated.
 
-Heat is conducted where `heat` is not empty, without gradients: temperature [P], conductivity and
-specific heat; for materials that melt also liquid fraction [P], melting point and latent heat; and last, for the first
-two numbers in `TRANSFERS` of torch_mpm.heat, the temperature gradient [P, D]. Parameters are [], [1], [B] or [P].
+Heat is conducted where `heat` is not empty: temperature [P], conductivity and specific heat; for materials that melt
+also liquid fraction [P], melting point and latent heat; and last, for the first two numbers in `TRANSFERS` of
+torch_mpm.heat, the temperature gradient [P, D]. Parameters are [], [1], [B] or [P].
 `heat_options` are the number of the transfer, the maximum number of iterations, and whether the last of the
-`held_obstacles` holds its surface (1) instead of the nodes in it; `heat_scalars` are tolerance, reference [K]
-and the share of the dissipated energy that becomes heat.
+`held_obstacles` holds its surface (1) instead of the nodes in it; `heat_scalars` are tolerance, reference [K],
+the share of the dissipated energy that becomes heat, and the tolerance of the adjoint solves.
 `heat_terms` of the free surface are 0 for a flux, 1 for convection and 2 for radiation. `heat_boundaries` are the
 temperatures of the held obstacles [K, B], two numbers of each term [K, B, 2] (flux, coefficient or emissivity times the
 constant of Stefan and Boltzmann; and ambient temperature), and the power of a source [W/m³]; absent ones have the shape
-[0]. The result `heat` [P, m] has temperature, gradient and liquid fraction in its first columns, `heat_status` [B, 3]
+[0]. The columns of the result `heat` [P, m] are temperature, gradient and liquid fraction; `heat_status` [B, 3] has
 the number of solves that missed the tolerance, their largest residual [K], and the largest diffusion number of
-particles whose liquid fraction changed.
+particles whose liquid fraction changed. With laws that expand or melt, steps are computed without
+gradients, where `resident` is true. Tables have no gradients, and obstacles none beside a held surface.
 
 Where temperatures change, a name in `laws` may be that of a solid and, after a ~, of its liquid, as `Melting` has them.
 `thermal` are records of three numbers: a law, one of its parameters or -1 for the linear expansion of its material or
@@ -56,21 +57,27 @@ others. The second returns the schedule of the latest call of this thread on the
 Several times a second both ops run the handlers of signals, on the main thread. Where one of them raises, the op ends
 with a RuntimeError and without a result; `torch_mpm.rollout` raises the exception of the handler.
 
-Differentiable once, with respect to x, v, mass, volume, C, F, J, history, parameters, gravity, obstacles, impulse and
-scene_dt, the last without FLIP and without the dependence of obstacles on the time. Autograd stores the arguments of a
-call and the record, if any: 2 D + 2 D² numbers per particle of a solid (24 in 3-D) and its history.
+Differentiable once, with respect to x, v, mass, volume, C, F, J, history, parameters, gravity, obstacles, impulse,
+heat, heat_boundaries and scene_dt, the last without FLIP and without the dependence of obstacles on the time. Autograd
+stores the arguments of a call and the record, if any: 2 D + 2 D² numbers per particle of a solid (24 in 3-D) and its
+history.
 
-    torch.ops.torch_mpm.substeps_backward(grad_x, grad_v, grad_C, grad_F, grad_J, grad_history, grad_impulse, needs,
-        record, *arguments of substeps)
-        -> (x, v, C, F, J, history, mass, volume, parameters, gravity, obstacles, dt)
+    torch.ops.torch_mpm.substeps_backward(grads, needs, record, *arguments of substeps)
+        -> (x, v, C, F, J, history, mass, volume, parameters, gravity, obstacles, dt, heat, heat_parameters,
+            heat_boundaries, heat_status)
 
 recomputes the steps, where there is no record, and then computes their adjoints in reverse order; a record must be that
-of `substeps`, and its contents are not checked. Meanwhile it stores the inputs of each step: for a solid 2 D + 3 D²
-numbers per particle and step (33 in 3-D), D² more where a law is plastic, and the history; and the grid of each step
-where that is at most half as much. The adjoints are [P, ...], those of the parameters [P, number of parameters] and
-that of gravity, over the time step, a sum for each block of the grids of all scenes [B * blocks, D]; that of the time
-step, but for gravity, is [P]. The bits of `needs` (`MASS`, `VOLUME`, `PARAMETERS`, `GRAVITY`, `OBSTACLES`, `TIME_STEP`)
-select among the last six.
+of `substeps`, and its contents are not checked. `grads` are the adjoints of the results x, v, C, F, J, history, impulse
+and heat, None where they are zero: one list, since an op has at most 64 arguments. Meanwhile it stores the inputs of
+each step: for a solid 2 D + 3 D² numbers per particle and step (33 in 3-D), D² more where a law is plastic, the history
+and the columns of heat; and the grid of each step where that is at most half as much. The node temperatures of each
+step are solved again where no grid is stored, and those of its adjoint once. The adjoints are [P, ...], those of the
+parameters [P, number of parameters] and that of gravity, over the time step, a sum for each block of the grids of all
+scenes [B * blocks, D]; that of the time step, but for gravity, is [P]. Those of the parameters of heat are [P, 5], in
+the order of conductivity, specific heat, melting point, latent heat and power; `heat_boundaries` [B, m] are those of
+both numbers of each term and of the temperatures of the held obstacles; `heat_status` is that of the adjoint solves.
+The bits of `needs` (`MASS`, `VOLUME`, `PARAMETERS`, `GRAVITY`, `OBSTACLES`, `TIME_STEP`, `HEAT_PARAMETERS`,
+`HEAT_BOUNDARIES`) select among the adjoints from that of mass on.
 """
 
 from __future__ import annotations
@@ -86,14 +93,17 @@ from .arguments import refuse_vmap, sizes, soa_empty, sum_by_scene
 from .autograd import dispatch, register_autograd
 from .law import _entries, _of_history, _of_parameters
 
-MASS, VOLUME, PARAMETERS, GRAVITY, OBSTACLES, TIME_STEP = 1, 2, 4, 8, 16, 32
+MASS, VOLUME, PARAMETERS, GRAVITY, OBSTACLES, TIME_STEP, HEAT_PARAMETERS, HEAT_BOUNDARIES = (1 << k for k in range(8))
 """Bits of `needs` in csrc/rollout/substeps_backward.op.cpp."""
 
 _SCHEMA = {a.name: str(a.type) for a in torch.ops.torch_mpm.substeps.default._schema.arguments}
 ARGUMENTS = tuple(_SCHEMA)
 """Names of the arguments of `substeps`."""
 _TENSORS = [name for name, kind in _SCHEMA.items() if kind in ("Tensor", "Optional[Tensor]")]
-_ADJOINTS = ("x", "v", "C", "F", "J", "history", "mass", "volume", "parameters", "gravity", "obstacles", "dt")
+_ADJOINTS = ("x", "v", "C", "F", "J", "history", "mass", "volume", "parameters", "gravity", "obstacles", "dt", "heat",
+             "heat_parameters", "heat_boundaries", "heat_status")  # fmt: skip
+_LISTS = ("history", "parameters", "heat", "heat_boundaries")
+"""Lists of tensors that the op is differentiable by."""
 
 
 # ---- fake kernels: shapes and strides only
@@ -133,9 +143,9 @@ def _fake(
 
 
 def _columns_of_heat(given: dict[str, Any], dim: int) -> int:
-    """Temperature, gradient, liquid fraction, present volume and dissipated energy."""
+    """Temperature, gradient and liquid fraction."""
     count = len(given["heat"])
-    return 2 + (dim if count % 3 == 1 else 0) + (count >= 6) + any(share > 0 for share in given["heat_scalars"][2:3])
+    return 1 + (dim if count % 3 == 1 else 0) + (count >= 6)
 
 
 def _fake_record(x: Tensor) -> Tensor:
@@ -148,11 +158,12 @@ def _latest_schedule_fake(like):
 
 
 @torch.library.register_fake("torch_mpm::substeps_backward")
-def _backward_fake(grad_x, grad_v, grad_C, grad_F, grad_J, grad_history, grad_impulse, needs, record, *arguments):
+def _backward_fake(grads, needs, record, *arguments):
     given = dict(zip(_SCHEMA, arguments, strict=False))
     x, history = given["x"], given["history"]
     P, D = sizes(x, "x", 2)
     blocks = given["scenes"] * math.prod(given["layout"][2:])
+    numbers = 2 * len(given["heat_terms"]) + len(given["held_obstacles"])
     shapes = {"x": (P, D), "v": (P, D), "C": (P, D, D), "F": (P, D, D), "J": (P,)}
     return (
         *(None if given[name] is None else soa_empty(x, shape) for name, shape in shapes.items()),
@@ -163,6 +174,10 @@ def _backward_fake(grad_x, grad_v, grad_C, grad_F, grad_J, grad_history, grad_im
         x.new_empty(blocks, D) if needs & GRAVITY and given["gravity"] is not None else None,
         torch.empty_like(given["obstacles"]) if needs & OBSTACLES and given["obstacles"] is not None else None,
         soa_empty(x, (P,)) if needs & TIME_STEP else None,
+        soa_empty(x, (P, _columns_of_heat(given, D))) if given["heat"] else None,
+        soa_empty(x, (P, 5)) if needs & HEAT_PARAMETERS and given["heat"] else None,
+        x.new_empty((given["scenes"], numbers)) if needs & HEAT_BOUNDARIES and given["heat"] and numbers else None,
+        x.new_empty((given["scenes"], 3), dtype=torch.float64) if given["heat"] else None,
     )
 
 
@@ -171,32 +186,47 @@ def _backward_fake(grad_x, grad_v, grad_C, grad_F, grad_J, grad_history, grad_im
 
 def _setup(ctx: Any, inputs: Any, output: Any) -> None:
     given = dict(zip(_SCHEMA, inputs, strict=True)) | {"previous_status": None}  # The adjoint does not read these.
-    history, parameters = given["history"], given["parameters"]
-    ctx.variables = len(history)
+    lists = [given[name] for name in _LISTS]
+    ctx.lengths_of_lists = [len(tensors) for tensors in lists]
     ctx.set_materialize_grads(False)
-    ctx.save_for_backward(output[-1], *(given.pop(name) for name in _TENSORS), *history, *parameters)
+    ctx.save_for_backward(output[-1], *(given.pop(name) for name in _TENSORS), *(t for ts in lists for t in ts))
     ctx.given = given
 
 
-def _backward(ctx: Any, *grads: Any) -> Any:
+def _saved(ctx: Any) -> tuple[Tensor | None, dict[str, Any]]:
+    """The record, and the arguments by name."""
     record, *saved = ctx.saved_tensors  # Once: a checkpointed region unpacks a tensor only once.
     tensors, rest = dict(zip(_TENSORS, saved, strict=False)), saved[len(_TENSORS) :]
-    history, parameters = rest[: ctx.variables], rest[ctx.variables :]
-    given = ctx.given | tensors | {"history": history, "parameters": parameters}
+    lists = {}
+    for name, length in zip(_LISTS, ctx.lengths_of_lists, strict=True):
+        lists[name], rest = rest[:length], rest[length:]
+    return record, ctx.given | tensors | lists
+
+
+def _backward(ctx: Any, *grads: Any) -> Any:
+    record, given = _saved(ctx)
+    history, parameters, heat, boundaries = (given[name] for name in _LISTS)
     wanted = dict(zip(_SCHEMA, ctx.needs_input_grad, strict=True))
     wants_dt = wanted["scene_dt"]
     needs = MASS * wanted["mass"] + VOLUME * wanted["volume"] + GRAVITY * (wanted["gravity"] or wants_dt)
-    needs += TIME_STEP * wants_dt
+    needs += TIME_STEP * wants_dt + HEAT_PARAMETERS * any([*wanted["heat"], *wanted["heat_boundaries"][2:]])
+    needs += HEAT_BOUNDARIES * any(wanted["heat_boundaries"][:2])
     needs += PARAMETERS * any(wanted["parameters"]) + OBSTACLES * wanted["obstacles"]
     by_impulse = None if grads[7] is None else grads[7].contiguous()
     arguments = (given[name] for name in _SCHEMA)
     op = torch.ops.torch_mpm.substeps_backward
-    adjoints = interruptible(dispatch, op, *grads[:6], by_impulse, needs, record, *arguments)
-    found = dict(zip(_ADJOINTS, adjoints, strict=True)) | {"impulse": grads[7], "heat": [None] * len(given["heat"])}
-    found["heat_boundaries"] = [None] * len(given["heat_boundaries"])
+    adjoints = interruptible(dispatch, op, [*grads[:6], by_impulse, grads[10]], needs, record, *arguments)
+    found = dict(zip(_ADJOINTS, adjoints, strict=True)) | {"impulse": grads[7]}
+    if found["heat_status"] is not None and hasattr(ctx, "report"):
+        ctx.report(found["heat_status"])
     found["tables"] = [None] * len(given["tables"])
     found["history"] = _of_history(found["history"], history, wanted["history"])
     found["parameters"] = _of_parameters(found["parameters"], parameters, wanted["parameters"], given["scene"])
+    of_parameters, scene = found["heat_parameters"], given["scene"]
+    found["heat"] = _of_heat(found["heat"], of_parameters, heat, wanted["heat"], scene)
+    found["heat_boundaries"] = _of_boundaries(
+        found["heat_boundaries"], of_parameters, boundaries, wanted["heat_boundaries"], scene
+    )
     by_dt = found.pop("dt")
     if wants_dt:
         sums = sum_by_scene(by_dt, given["scene"], given["scenes"])  # One scene by default.
@@ -208,8 +238,39 @@ def _backward(ctx: Any, *grads: Any) -> Any:
         found["gravity"] = dt * change
         if wants_dt:
             found["scene_dt"] = found["scene_dt"] + given["dt"] * (given["gravity"] * change).sum(1)
-    lists = ("history", "parameters", "heat", "heat_boundaries", "tables")
+    lists = (*_LISTS, "tables")
     return tuple(found.get(name) if name in lists or wanted[name] is True else None for name in _SCHEMA)
+
+
+def _of_heat(
+    fields: Tensor | None, parameters: Tensor | None, heat: list[Tensor], wanted: list[bool], scene: Tensor | None
+) -> list[Tensor | None]:
+    """Gradients of the tensors of `heat`, from those of the columns of the result and of the parameters [P, 5]."""
+    if fields is None or parameters is None or not any(wanted):
+        return [None] * len(heat)
+    melts, dim = len(heat) >= 6, heat[-1].shape[1] if len(heat) % 3 == 1 else 0
+    places = [1, 2, *([4, 5] if melts else [])]
+    of_parameters = _of_parameters(parameters, [heat[k] for k in places], [wanted[k] for k in places], scene)
+    grads = dict(zip(places, of_parameters, strict=True)) | {0: fields[:, 0]}
+    if melts:
+        grads[3] = fields[:, 1 + dim]
+    if dim:
+        grads[len(heat) - 1] = fields[:, 1 : 1 + dim]
+    return [grads[k] if wanted[k] else None for k in range(len(heat))]
+
+
+def _of_boundaries(
+    sums: Tensor | None, parameters: Tensor | None, given: list[Tensor], wanted: list[bool], scene: Tensor | None
+) -> list[Tensor | None]:
+    """Gradients of `heat_boundaries`, from those of numbers and temperatures [B, m] and of the parameters [P, 5]."""
+    grads: list[Tensor | None] = [None] * len(given)
+    if sums is not None:
+        first = 2 * given[1].shape[0] if given[1].numel() else 0
+        grads[0] = sums[:, first:].T if wanted[0] else None
+        grads[1] = sums[:, :first].unflatten(1, (-1, 2)).transpose(0, 1) if wanted[1] else None
+    if parameters is not None and wanted[2:] == [True]:
+        (grads[2],) = _of_parameters(parameters[:, 4:], given[2:], wanted[2:], scene)
+    return grads
 
 
 def _no_second_derivatives(ctx: Any, *grads: Any) -> None:

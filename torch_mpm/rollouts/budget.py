@@ -49,9 +49,10 @@ def steps_of_a_call(state: State, n: int) -> int:
 
 
 def bytes_of_a_substep(state: State) -> int:
-    """Upper bound of the memory that the backward pass of the op uses per step of a solid [bytes]: for the particles,
-    and half as much for the grid."""
+    """Upper bound of the memory that the backward pass of the op uses per step of a solid [bytes]: for the particles
+    with their history and heat, and half as much as without these for the grid."""
     D, size = state.x.shape[1], state.x.element_size()
     rows = len(state) + (0 if state.x.is_cuda else PADDING // size)
     history = sum(t[0].numel() for t in state.extra.values()) if len(state) else 0
-    return rows * (3 * (2 * D + 4 * D * D) // 2 + history) * size
+    heat = 0 if state.temperature is None else 2  # With the dissipated energy; its other fields are in `extra`.
+    return rows * (3 * (2 * D + 4 * D * D) // 2 + history + heat) * size

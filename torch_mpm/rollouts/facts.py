@@ -12,10 +12,12 @@ from .._library import graph_loops
 from ..boundaries import Obstacle
 from ..boundaries.obstacles import motion_tensors
 from ..cuda_graphs.capture import is_captured
+from ..heat.boundaries import Term
+from ..heat.heat import Heat
 from ..laws import CompiledLaw
 from ..laws.active import Active
 from ..laws.calls import laws_of, passive
-from ..laws.parameters import tensors_in
+from ..laws.parameters import PerMaterial, tensors_in
 from ..laws.thermal_calls import laws_in
 from ..ops.obstacle_tables import numbers_of_a_step, path_requires_grad
 from ..state.state import ROLES, State
@@ -144,10 +146,22 @@ def wants_gradient(steps: Steps, state: State) -> bool:
     """Whether the fused op is differentiated. Functions of time are called at the first and the last of the steps."""
     if not torch.is_grad_enabled():
         return False
+    step, _, dt, *_ = steps
+    assert isinstance(step, Step)
+    return differentiates(step, state, dt) or _paths_require_grad(steps, state)
+
+
+def obstacles_require_grad(steps: Steps, state: State) -> bool:
+    """Whether a tensor of an obstacle, or one of its positions on a path, requires grad."""
+    step = steps.step
+    assert isinstance(step, Step)
+    tensors = [t for b in _obstacles(step) for t in motion_tensors(b)]
+    return any([t.requires_grad for t in tensors]) or _paths_require_grad(steps, state)
+
+
+def _paths_require_grad(steps: Steps, state: State) -> bool:
     step, n, dt, *_ = steps
     assert isinstance(step, Step)
-    if differentiates(step, state, dt):
-        return True
     if not follows_paths(step):
         return False
     times = StepTimes.of(state, n, dt, step.grid.scenes)
@@ -168,10 +182,8 @@ def _obstacles(step: Step) -> list[Obstacle]:
     return [b for b in step.boundaries.entries if isinstance(b, Obstacle)]
 
 
-_READ = tuple(
-    name for name, role in ROLES.items() if role.differentiable and role.changed_by != "heat" and name != "extra"
-)
-"""Differentiable fields that the fused op reads, beside history. It conducts no heat."""
+_READ = tuple(name for name, role in ROLES.items() if role.differentiable and name not in ("extra", "temperature"))
+"""Differentiable fields that the fused op reads, beside history and those of heat."""
 
 
 def _differentiable(step: Step, state: State) -> list[Tensor]:
@@ -179,4 +191,12 @@ def _differentiable(step: Step, state: State) -> list[Tensor]:
     fields = (*(getattr(state, name) for name in _READ), *state.extra.values())
     gravity = [step.gravity] if isinstance(step.gravity, Tensor) else []
     obstacles = [t for b in _obstacles(step) for t in motion_tensors(b)]
-    return [*(t for t in fields if t is not None), *gravity, *tensors_in(step.law), *obstacles]
+    heat = [] if step.heat is None else [state.temperature, *_parameters_of_heat(step.heat)]
+    return [*(t for t in (*fields, *heat) if t is not None), *gravity, *tensors_in(step.law), *obstacles]
+
+
+def _parameters_of_heat(heat: Heat) -> list[Tensor]:
+    """Tensors among the parameters of heat and the numbers of its boundaries."""
+    parts = [part for v in heat.parameter_values for part in (v.values() if isinstance(v, PerMaterial) else (v,))]
+    terms = [t for term in heat.boundaries.entries if isinstance(term, Term) for t in tensors_in(term)]
+    return [*(part for part in parts if isinstance(part, Tensor)), *terms]

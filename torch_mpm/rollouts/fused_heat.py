@@ -19,11 +19,13 @@ from ..heat.boundaries import (
     Source,
 )
 from ..heat.heat import GRADIENT, TRANSFERS, Heat
-from ..laws.parameters import PerMaterial, check_length, evaluate, needed_temperature
+from ..laws.calls import laws_of, passive
+from ..laws.parameters import PerMaterial, check_length, evaluate, needed_temperature, tensors_in
 from ..laws.thermal import LIQUID
+from ..laws.thermal_calls import THERMAL, is_thermal
 from ..state.state import State
 from ..step.step import Step
-from .facts import wants_gradient
+from .facts import obstacles_require_grad, wants_gradient
 from .steps import Steps
 
 
@@ -41,15 +43,25 @@ def why_not_fused_heat(step: Step, state: State, n: int, dt: float | Tensor) -> 
         return f"its heat is solved by {heat.method}"
     if step.stress_form != "mls":
         return "it conducts heat with another stress form than mls"
-    values = _values(heat)
-    if any(_is_function(value) for value in values):
+    if any(_is_function(value) for value in heat.parameter_values):
         return "a parameter of its heat is a function"
-    if torch.is_grad_enabled():
-        parts = [part for v in values for part in (v.values() if isinstance(v, PerMaterial) else (v,))]
-        if any(t.requires_grad for t in (*parts, *_fields(heat, state)) if isinstance(t, Tensor)) or wants_gradient(
-            Steps(step, n, dt), state
-        ):
-            return "it conducts heat, and a gradient is wanted"
+    steps = Steps(step, n, dt)
+    if (reason := _why_no_adjoint_of_laws(step)) is not None and wants_gradient(steps, state):
+        return f"{reason}, and a gradient is wanted"
+    surface = any(type(term) is FixedSurface for term in heat.boundaries.entries)
+    if surface and torch.is_grad_enabled() and obstacles_require_grad(steps, state):
+        return "a surface is held at a temperature, and a gradient is wanted by an obstacle"
+    return None
+
+
+def _why_no_adjoint_of_laws(step: Step) -> str | None:
+    """Reason why the op has no gradients of laws that read the temperature; None if it has, where these are tables of
+    constant parameters (`check_heat_has_gradients` in csrc/rollout)."""
+    laws = [law for law in map(passive, laws_of(step.law)) if is_thermal(law)]
+    if any(type(law) in THERMAL for law in laws):
+        return "a law expands or melts"
+    if any(t.requires_grad for law in laws for t in tensors_in(law)):
+        return "a law reads the temperature and has parameters with gradients"
     return None
 
 
@@ -74,8 +86,8 @@ def _why_not_boundaries(step: Step, heat: Heat) -> str | None:
             return f"{type(term).__name__} acts on points of a surface"
         for name in _names(term):
             value = getattr(term, name)
-            if _is_function(value) or (isinstance(value, Tensor) and value.requires_grad):
-                return f"{name} of {type(term).__name__} is a function, or requires a gradient"
+            if _is_function(value):
+                return f"{name} of {type(term).__name__} is a function"
             if type(term) is Source or not isinstance(value, Tensor):
                 continue
             if value.shape not in ((), (1,), (heat.grid.scenes,)):
@@ -124,7 +136,7 @@ def _held(step: Step, x: Tensor) -> tuple[list[int], int, Tensor]:
 
 def _of_scenes(value: Any, like: Tensor, scenes: int) -> Tensor:
     """A value for each scene [B], from one of a shape that `_why_not_boundaries` supports."""
-    return _like(value, like).detach().reshape(-1).expand(scenes)
+    return _like(value, like).reshape(-1).expand(scenes)
 
 
 def _like(value: Any, like: Tensor) -> Tensor:
@@ -140,16 +152,6 @@ def _is_function(value: Any) -> bool:
     if isinstance(value, PerMaterial):
         return any(_is_function(part) for part in value.values())
     return callable(value) and not isinstance(value, Tensor)
-
-
-def _values(heat: Heat) -> tuple[Any, ...]:
-    """Parameters in the order of the op."""
-    melting = (heat.melting_point, heat.latent_heat) if heat.melts else ()
-    return (heat.conductivity, heat.specific_heat, *melting)
-
-
-def _fields(heat: Heat, state: State) -> tuple[Tensor | None, ...]:
-    return state.temperature, state.extra.get(GRADIENT), state.extra.get(LIQUID)
 
 
 def _tensor(name: str, value: Any, state: State, scenes: int) -> Tensor:
@@ -171,7 +173,7 @@ def heat_arguments(step: Step, state: State) -> tuple[Any, ...]:
         return [], [], [], [], [], []
     temperature, scenes = needed_temperature(state), heat.grid.scenes
     names = ("conductivity", "specific_heat", "melting_point", "latent_heat")
-    values = [_tensor(name, v, state, scenes) for name, v in zip(names, _values(heat), strict=False)]
+    values = [_tensor(name, v, state, scenes) for name, v in zip(names, heat.parameter_values, strict=False)]
     melting = [state.extra[LIQUID], *values[2:]] if heat.melts else []
     gradient = [state.extra[GRADIENT]] if heat.affine else []
     numbers, surface, temperatures = _held(step, state.x)
@@ -179,12 +181,16 @@ def heat_arguments(step: Step, state: State) -> tuple[Any, ...]:
     options = [TRANSFERS.index(heat.transfer), heat.max_iterations, surface]
     boundaries = [temperatures, of_terms, power] if heat.boundaries.entries else []
     tensors = [temperature, *values[:2], *melting, *gradient]
-    return tensors, options, [heat.tolerance, heat.reference, heat.plastic_heating], numbers, terms, boundaries
+    scalars = [heat.tolerance, heat.reference, heat.plastic_heating, heat.adjoint_tolerance]
+    return tensors, options, scalars, numbers, terms, boundaries
 
 
 def heat_changes(heat: Heat, state: State, packed: Tensor, status: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-    """Temperature after the steps, and the other fields of heat by their keys in `State.extra`; stores the status."""
+    """Temperature after the steps, and the other fields of heat by their keys in `State.extra`; stores the status, and
+    later that of the adjoint solves."""
     heat.count(status)
+    if packed.grad_fn is not None:
+        packed.grad_fn.report = heat.count_adjoint  # type: ignore[attr-defined]
     dim, extra, first = state.x.shape[1], {}, 1
     if heat.affine:
         extra[GRADIENT] = packed[:, first : first + dim]

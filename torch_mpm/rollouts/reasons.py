@@ -79,7 +79,7 @@ def why_not_fused(step: Any, state: State, n: int, dt: float | Tensor) -> str | 
         return f"a boundary acts by torch operations, {type(others[0]).__name__}"
     if len(obstacles) > MAX_OBSTACLES:
         return f"there are more than {MAX_OBSTACLES} obstacles"
-    if torch.is_grad_enabled() and any(part.has_functions for part in laws):
+    if torch.is_grad_enabled() and step.heat is None and any(part.has_functions for part in laws):
         return "a parameter is a function, which may have a gradient"
     return None
 

@@ -69,12 +69,12 @@ def rollout(
         plan: the plan of `plan_rollout` for these steps, in place of `checkpoint`, `graph` and `schedule`. None: the
             rollout makes it.
 
-    A `Step` of compiled laws without user functions computes all steps in one op, or in a few calls of it. With
-    heat it does so without gradients, if the boundaries of the heat are held obstacles of the step, sources, or
-    terms of the free surface with constant numbers, and on the CPU also if laws expand or melt, or have a `Table`
-    of the temperature among their parameters. `Step.explain` returns the executor, the schedule and the reasons.
-    The results are those of single steps. On CUDA they are bitwise equal, with two exceptions, which round
-    differently, as all steps on a CPU do:
+    A `Step` of compiled laws without user functions computes all steps in one op, or in a few calls of it. With heat it
+    does so if the boundaries of the heat are held obstacles of the step, sources, or terms of the free surface with
+    constant numbers; laws may expand or melt, or have a `Table` of the temperature among their parameters. Gradients
+    need single steps with laws that expand or melt, by parameters of laws with a `Table`, and by an obstacle beside a
+    `FixedSurface`. `Step.explain` returns the executor, the schedule and the reasons. The results are those of single
+    steps. On CUDA they are bitwise equal, with two exceptions, which round differently, as all steps on a CPU do:
 
     - float32 without gradients;
     - many unsorted particles (`state.ids` is None): for 64 steps or more they are sorted first, and restored to their
@@ -85,8 +85,9 @@ def rollout(
     The backward pass of the op recomputes the steps from stored states: one every `checkpoint` steps, by default
     sqrt(n) of them, and more where states are small. A stored state of a solid has 2 D + 2 D² numbers per particle (24
     in 3-D, 96 bytes in float32) and its history. While the backward pass processes `checkpoint` steps, it stores about
-    2 D + 4 D² numbers per particle (42 in 3-D) for each of them, and at most half as much for the grid. If all steps
-    fit into `Checkpoints(memory=...)`, they are stored and not recomputed. Second derivatives need single steps.
+    2 D + 4 D² numbers per particle (42 in 3-D) for each of them, those of heat, and at most half as much for the grid.
+    If all steps fit into `Checkpoints(memory=...)`, they are stored and not recomputed. Second derivatives need single
+    steps.
 
     On CUDA and without gradients, other steps without user functions are replays of a CUDA graph of one step.
     `make_graphed_step` serves steps with user functions, and `estimate_rollout` returns the memory and time of a

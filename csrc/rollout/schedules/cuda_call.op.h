@@ -77,7 +77,7 @@ class CudaCall {
 
   int64_t P() const { return in_.x.size(0); }
 
-  Tensor heat() const { return heat_ ? heat_->fields.tensor() : Tensor(); }
+  Tensor heat() const { return heat_ ? heat_->state() : Tensor(); }
 
   int* status(int k) { return static_cast<int*>(status_[k].data_ptr()); }
 

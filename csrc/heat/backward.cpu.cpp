@@ -1,0 +1,155 @@
+#include "heat/local_backward.h"
+#include "transfer/gather.cpu.h"
+
+// Adjoint of a step of heat, one pass over the particles for G2P and one for P2G.
+namespace mpm::cpu {
+inline namespace TORCH_MPM_ISA {
+namespace {
+
+// A group as the particles of a body. It stores no lane beyond the group, whose particles others still read.
+template <class T>
+struct AtGroup {
+  using Value = Lanes<T>;
+  const Group& g;
+
+  MPM_HD Value load(const T* pointer, int64_t stride) const { return load_row(pointer, stride, g); }
+  MPM_HD void store(T* pointer, int64_t stride, const Value& value) const {
+    if (g.consecutive && g.count < kLanes)
+      store_row_exactly(value, pointer, stride, g);
+    else
+      store_row(value, pointer, stride, g);
+  }
+};
+
+// The bodies are calls, which do not depend on the order of the B-spline.
+template <bool Affine, class T, int D>
+[[gnu::noinline]] void pull_back(const HeatToParticlesBackwardArguments<T, D>& a, const Group& g, int scene,
+                                 const HeatGathered<Lanes<T>, D, 2>& gathered) {
+  const Lanes<T> dt(step_of_scene(a.forward.scene_dt, a.forward.dt, scene));
+  heat_of_particles_backward<Affine>(a, AtGroup<T>{g}, scene, dt, gathered);
+}
+
+template <class T, int D>
+[[gnu::noinline]] void pull_back(const HeatToNodesBackwardArguments<T, D>& a, const Group& g, int scene,
+                                 const HeatGathered<Lanes<T>, D, kHeatChannels>& gathered) {
+  const Lanes<T> dt(step_of_scene(a.forward.scene_dt, a.forward.dt, scene));
+  heat_of_nodes_backward(a, AtGroup<T>{g}, scene, dt, gathered);
+}
+
+// What particles gather, with moments times a scale.
+template <int Order, int Channels, bool Affine, class T, int D>
+MPM_HD HeatGathered<Lanes<T>, D, Channels> gathered(const Lanes<T> f[D], const T* tile, double scale) {
+  Sums<Lanes<T>, D> sums[Channels];
+  gather_channels<Order, Channels, Affine, false, T, D>(f, tile, sums);
+  HeatGathered<Lanes<T>, D, Channels> r;
+  MPM_UNROLL for (int k = 0; k < Channels; k++) {
+    r.value[k] = sums[k].value;
+    MPM_UNROLL for (int d = 0; d < D; d++)
+      r.moment[k][d] = Affine ? Lanes<T>(scale) * sums[k].moment[d] : Lanes<T>(0);
+  }
+  return r;
+}
+
+template <int Order, bool Affine, class T, int D>
+void from_particles(const HeatToParticlesBackwardArguments<T, D>& a) {
+  const HeatToParticlesArguments<T, D>& in = a.forward;
+  const double scale = in.moment_scale * double(in.topology.geometry.dx);
+  gather_groups<Order>(in.topology, in.x, in.nodes, 0, 2,
+                       [&](const Group& g, const Lanes<T> f[D], int scene, const T* tile) {
+                         pull_back<Affine>(a, g, scene, gathered<Order, 2, Affine, T, D>(f, tile, scale));
+                       });
+}
+
+template <int Order, bool Affine, class T, int D>
+void from_nodes(const HeatToNodesBackwardArguments<T, D>& a) {
+  const HeatToNodesArguments<T, D>& in = a.forward;
+  const double dx = double(in.topology.geometry.dx);
+  gather_groups<Order>(in.topology, in.x, a.nodes, 0, kHeatChannels,
+                       [&](const Group& g, const Lanes<T> f[D], int scene, const T* tile) {
+                         pull_back(a, g, scene, gathered<Order, kHeatChannels, Affine, T, D>(f, tile, dx));
+                       });
+}
+
+// visit(scene, corner, slot) for the blocks of the scenes, and visit(scene, node) for their nodes.
+template <class T, int D, class F>
+void for_blocks(const Topology<T, D>& t, const F& visit) {
+  constexpr int64_t grain = 64;  // slots below which a range is not split
+  parallel_ranges(t.max_blocks, grain, [&](int64_t begin, int64_t end) {
+    for (int64_t slot = begin; slot < end; slot++) {
+      const int block = t.block[slot];
+      if (block < 0 || block / t.geometry.blocks_per_scene >= t.scenes) continue;
+      const BaseBlock<T, D> base(t, int(slot));
+      visit(base.scene, base.corner, slot);
+    }
+  });
+}
+
+template <class T, int D, class F>
+void for_nodes(const Topology<T, D>& t, const F& visit) {
+  for_blocks(t, [&](int scene, const int (&)[D], int64_t slot) {
+    for (int64_t i = slot * kBlockNodes<D>; i < (slot + 1) * kBlockNodes<D>; i++) visit(scene, i);
+  });
+}
+
+}  // namespace
+
+template <int Order, class T, int D>
+void heat_to_particles_backward(const HeatToParticlesBackwardArguments<T, D>& a) {
+  a.gradient.pointer ? from_particles<Order, true>(a) : from_particles<Order, false>(a);
+}
+
+template <class T, int D>
+void heat_term_backward(const HeatTermBackwardArguments<T, D>& a) {
+  for_nodes(a.forward.topology, [&](int scene, int64_t i) { heat_of_term_backward(a, scene, i); });
+}
+
+template <class T, int D>
+void heat_numbers_backward(const HeatNumbersBackwardArguments<T, D>& a) {
+  for_blocks(a.term.forward.topology,
+             [&](int scene, const int (&corner)[D], int64_t slot) { heat_numbers_of_slot(a, scene, corner, slot); });
+}
+
+template <class T, int D>
+void heat_held_backward(const HeatHeldBackwardArguments<T, D>& a) {
+  for_blocks(a.hold.topology, [&](int scene, const int (&corner)[D], int64_t slot) {
+    held_temperature_of_slot(a, scene, corner, slot);
+  });
+}
+
+template <class T, int D>
+void heat_surface_temperature_backward(const HeatSurfaceTemperatureBackwardArguments<T, D>& a) {
+  for_blocks(a.topology, [&](int scene, const int (&corner)[D], int64_t slot) {
+    surface_temperature_of_slot(a, scene, corner, slot);
+  });
+}
+
+template <class T, int D>
+void heat_nodes_backward(const HeatNodesBackwardArguments<T, D>& a) {
+  for_nodes(a.topology, [&](int scene, int64_t i) { heat_of_node_backward(a, scene, i); });
+}
+
+template <class T, int D>
+void heat_layers_backward(const HeatLayersBackwardArguments<T, D>& a) {
+  constexpr int64_t grain = 512;  // particles below which a range is not split
+  parallel_ranges(a.layers.particles, grain, [&](int64_t begin, int64_t end) {
+    for (int64_t p = begin; p < end; p++) heat_layer_backward(a, p);
+  });
+}
+
+template <int Order, class T, int D>
+void heat_to_nodes_backward(const HeatToNodesBackwardArguments<T, D>& a) {
+  a.gradient.pointer ? from_nodes<Order, true>(a) : from_nodes<Order, false>(a);
+  for_outside(a.forward.topology, [&](int64_t p) { skip_heat_of_nodes_backward(a, p); });
+}
+
+MPM_INSTANTIATE_ORDERS(heat_to_particles_backward, HeatToParticlesBackwardArguments)
+MPM_INSTANTIATE(heat_term_backward, HeatTermBackwardArguments)
+MPM_INSTANTIATE(heat_numbers_backward, HeatNumbersBackwardArguments)
+MPM_INSTANTIATE(heat_held_backward, HeatHeldBackwardArguments)
+MPM_INSTANTIATE(heat_surface_temperature_backward, HeatSurfaceTemperatureBackwardArguments)
+MPM_INSTANTIATE(heat_nodes_backward, HeatNodesBackwardArguments)
+MPM_INSTANTIATE(heat_layers_backward, HeatLayersBackwardArguments)
+MPM_INSTANTIATE_ORDERS(heat_to_nodes_backward, HeatToNodesBackwardArguments)
+
+}  // namespace TORCH_MPM_ISA
+}  // namespace mpm::cpu

@@ -1,0 +1,189 @@
+#include "heat/local_backward.h"
+
+#include "cuda/for_each.cuh"
+#include "heat/kernels.h"
+#include "transfer/gather.cuh"
+
+// Adjoint of a step of heat, one pass over the particles for G2P and one for P2G.
+namespace mpm::cuda {
+namespace {
+
+// The sums of the first K channels, with moments from channel `Plain` on; the particles of a call are those of its
+// activation.
+template <int Order_, class T_, int D_, int K_, int Plain, bool Affine>
+struct HeatAdjointSums {
+  using T = T_;
+  static constexpr int Order = Order_, D = D_, K = K_;
+  static constexpr int resident = 2;  // dual numbers need registers
+  using Shape = SumShape<Order, T, D, K, Plain, Affine, false, SlopeForm::none>;
+  struct Loaded {
+    int scene;
+  };
+  using Result = Sums<Shape>;
+  Topology<T, D> topology;
+  NodeField<const T> nodes;
+  Columns<const T, D> position;
+  T moment_scale;
+
+  HeatAdjointSums(const Topology<T, D>& t, const NodeField<const T>& n, const Field<const T>& x, double scale)
+      : topology(t), nodes(n), position(x), moment_scale(T(scale * double(t.geometry.dx))) {}
+
+  __device__ Loaded load(int, int scene) const { return {scene}; }
+  template <class Support>
+  __device__ Result compute(const Loaded&, const Weights<Order, T, D>& w, const Support& support) const {
+    const T constant[K] = {}, linear[K][D] = {};
+    Result s;
+    sum_axis<Shape, 0>(support, support.rows, 0, w, constant, linear, s);
+    return s;
+  }
+  __device__ HeatGathered<T, D, K> gathered(const Result& s) const {
+    HeatGathered<T, D, K> g;
+#pragma unroll
+    for (int k = 0; k < K; k++) {
+      g.value[k] = s.value[k];
+#pragma unroll
+      for (int d = 0; d < D; d++) g.moment[k][d] = Affine && k >= Plain ? moment_scale * s.moment[k][d] : T(0);
+    }
+    return g;
+  }
+};
+
+template <int Order, class T, int D, bool Affine>
+struct HeatToParticlesPullBack : HeatAdjointSums<Order, T, D, 2, 0, Affine> {
+  using Base = HeatAdjointSums<Order, T, D, 2, 0, Affine>;
+  HeatToParticlesBackwardArguments<T, D> a;
+
+  explicit HeatToParticlesPullBack(const HeatToParticlesBackwardArguments<T, D>& arguments)
+      : Base(arguments.forward.topology, arguments.forward.nodes, arguments.forward.x, arguments.forward.moment_scale),
+        a(arguments) {}
+
+  __device__ void write(int p, const typename Base::Loaded& l, const typename Base::Result& s) const {
+    const T dt = step_of_scene(a.forward.scene_dt, a.forward.dt, l.scene);
+    heat_of_particles_backward<Affine>(a, One<T>{p}, l.scene, dt, this->gathered(s));
+  }
+  __device__ void skip(int) const {}
+};
+
+static_assert(kHeatTheta == 2 && kHeatMean == 3);  // the channels with moments
+template <int Order, class T, int D, bool Affine>
+struct HeatToNodesPullBack : HeatAdjointSums<Order, T, D, kHeatChannels, kHeatTheta, Affine> {
+  using Base = HeatAdjointSums<Order, T, D, kHeatChannels, kHeatTheta, Affine>;
+  HeatToNodesBackwardArguments<T, D> a;
+
+  explicit HeatToNodesPullBack(const HeatToNodesBackwardArguments<T, D>& arguments)
+      : Base(arguments.forward.topology, arguments.nodes, arguments.forward.x, 1), a(arguments) {}
+
+  __device__ void write(int p, const typename Base::Loaded& l, const typename Base::Result& s) const {
+    const T dt = step_of_scene(a.forward.scene_dt, a.forward.dt, l.scene);
+    heat_of_nodes_backward(a, One<T>{p}, l.scene, dt, this->gathered(s));
+  }
+  __device__ void skip(int p) const { skip_heat_of_nodes_backward(a, p); }
+};
+
+// Calls work(a, scene, i) at a node of a block of the scenes.
+template <auto work, class T, int D, class Arguments>
+MPM_HD void at_node(const Topology<T, D>& t, const Arguments& a, int64_t i) {
+  const int block = t.block[i / kBlockNodes<D>], scene = block / t.geometry.blocks_per_scene;
+  if (block >= 0 && scene < t.scenes) work(a, scene, i);
+}
+
+template <class T, int D>
+MPM_HD void term_backward(const HeatTermBackwardArguments<T, D>& a, int64_t i) {
+  at_node<heat_of_term_backward<T, D>>(a.forward.topology, a, i);
+}
+
+template <class T, int D>
+MPM_HD void node_backward(const HeatNodesBackwardArguments<T, D>& a, int64_t i) {
+  at_node<heat_of_node_backward<T, D>>(a.topology, a, i);
+}
+
+// Calls work(a, scene, corner, slot) for the block of a slot.
+template <auto work, class T, int D, class Arguments>
+MPM_HD void at_slot(const Topology<T, D>& t, const Arguments& a, int64_t slot) {
+  const int block = t.block[slot];
+  if (block < 0) return;
+  int corner[D];
+  const int scene = block_coordinates(t.geometry, block, corner);
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    corner[i] *= kBlockWidth;
+  if (scene < t.scenes) work(a, scene, corner, slot);
+}
+
+template <class T, int D>
+MPM_HD void numbers_backward(const HeatNumbersBackwardArguments<T, D>& a, int64_t slot) {
+  at_slot<heat_numbers_of_slot<T, D>>(a.term.forward.topology, a, slot);
+}
+
+template <class T, int D>
+MPM_HD void held_backward(const HeatHeldBackwardArguments<T, D>& a, int64_t slot) {
+  at_slot<held_temperature_of_slot<T, D>>(a.hold.topology, a, slot);
+}
+
+template <class T, int D>
+MPM_HD void surface_temperature_backward(const HeatSurfaceTemperatureBackwardArguments<T, D>& a, int64_t slot) {
+  at_slot<surface_temperature_of_slot<T, D>>(a.topology, a, slot);
+}
+
+template <class T, int D>
+int64_t nodes_of(const Topology<T, D>& t) {
+  return int64_t(t.max_blocks) * kBlockNodes<D>;
+}
+
+}  // namespace
+
+template <int Order, class T, int D>
+void heat_to_particles_backward(const HeatToParticlesBackwardArguments<T, D>& a, Stream stream) {
+  if (a.gradient.pointer)
+    launch_gather(HeatToParticlesPullBack<Order, T, D, true>(a), stream);
+  else
+    launch_gather(HeatToParticlesPullBack<Order, T, D, false>(a), stream);
+}
+
+template <class T, int D>
+void heat_term_backward(const HeatTermBackwardArguments<T, D>& a, Stream stream) {
+  for_each<term_backward<T, D>>(nodes_of(a.forward.topology), a, stream);
+}
+
+template <class T, int D>
+void heat_numbers_backward(const HeatNumbersBackwardArguments<T, D>& a, Stream stream) {
+  for_each<numbers_backward<T, D>>(a.term.forward.topology.max_blocks, a, stream);
+}
+
+template <class T, int D>
+void heat_held_backward(const HeatHeldBackwardArguments<T, D>& a, Stream stream) {
+  for_each<held_backward<T, D>>(a.hold.topology.max_blocks, a, stream);
+}
+
+template <class T, int D>
+void heat_surface_temperature_backward(const HeatSurfaceTemperatureBackwardArguments<T, D>& a, Stream stream) {
+  for_each<surface_temperature_backward<T, D>>(a.topology.max_blocks, a, stream);
+}
+
+template <class T, int D>
+void heat_nodes_backward(const HeatNodesBackwardArguments<T, D>& a, Stream stream) {
+  for_each<node_backward<T, D>>(nodes_of(a.topology), a, stream);
+}
+
+template <class T, int D>
+void heat_layers_backward(const HeatLayersBackwardArguments<T, D>& a, Stream stream) {
+  for_each<heat_layer_backward<T, D>>(a.layers.particles, a, stream);
+}
+
+template <int Order, class T, int D>
+void heat_to_nodes_backward(const HeatToNodesBackwardArguments<T, D>& a, Stream stream) {
+  if (a.gradient.pointer)
+    launch_gather(HeatToNodesPullBack<Order, T, D, true>(a), stream);
+  else
+    launch_gather(HeatToNodesPullBack<Order, T, D, false>(a), stream);
+}
+
+MPM_INSTANTIATE_ORDERS(heat_to_particles_backward, HeatToParticlesBackwardArguments)
+MPM_INSTANTIATE(heat_term_backward, HeatTermBackwardArguments)
+MPM_INSTANTIATE(heat_numbers_backward, HeatNumbersBackwardArguments)
+MPM_INSTANTIATE(heat_held_backward, HeatHeldBackwardArguments)
+MPM_INSTANTIATE(heat_surface_temperature_backward, HeatSurfaceTemperatureBackwardArguments)
+MPM_INSTANTIATE(heat_nodes_backward, HeatNodesBackwardArguments)
+MPM_INSTANTIATE(heat_layers_backward, HeatLayersBackwardArguments)
+MPM_INSTANTIATE_ORDERS(heat_to_nodes_backward, HeatToNodesBackwardArguments)
+
+}  // namespace mpm::cuda

@@ -1,0 +1,517 @@
+#pragma once
+
+#include "heat/backward.h"
+#include "heat/local.h"
+#include "pointwise/heat.h"
+
+// Adjoint of a step of heat at one node, particle or slot: the formulas of the step, differentiated by dual numbers.
+// The loops of both backends go over them.
+namespace mpm {
+inline namespace TORCH_MPM_ISA {
+
+template <class At, class T>
+MPM_HD typename At::Value load_value(const At& at, const HeatValue<T>& v, int scene) {
+  using V = typename At::Value;
+  if (v.per_scene || v.stride == 0) return V(v.pointer[v.per_scene ? scene * v.stride : 0]);
+  return at.load(v.pointer, v.stride);
+}
+
+// Time step of a scene.
+template <class T>
+MPM_HD T step_of_scene(const Field<const T>& scene_dt, double dt, int scene) {
+  return scene_dt.pointer ? T(dt) * scene_dt.pointer[scene * scene_dt.stride[0]] : T(dt);
+}
+
+// Column k of a field [P, K] or [P, K, D].
+template <class T>
+MPM_HD Field<T> entry(const Field<T>& f, int k) {
+  return {f.pointer + k * f.stride[1], {f.stride[0], f.stride[2], 0}};
+}
+
+template <class At, class T>
+MPM_HD void add_scalar(const At& at, const Field<T>& f, const typename At::Value& value) {
+  if (f.pointer) store_scalar(Adding<At>(at), f, value);
+}
+
+// Adds to the adjoint of a parameter, if it is wanted.
+template <class At, class T>
+MPM_HD void add_parameter(const At& at, const Field<T>& f, HeatParameter k, const typename At::Value& value) {
+  if (f.pointer) store_scalar(Adding<At>(at), entry(f, k), value);
+}
+
+// What a particle has gathered: values of channels, and their moments about it.
+template <class V, int D, int Channels>
+struct HeatGathered {
+  V value[Channels];
+  Vector<V, D> moment[Channels];
+};
+
+// Derivatives of a sum by the first `count` of its inputs; f returns its derivative at dual inputs.
+template <int N, class V, class F>
+MPM_HD void pull_back(const V (&in)[N], V (&grad)[N], int count, const F& f) {
+  Dual<V> x[N];
+  MPM_UNROLL for (int n = 0; n < N; n++)
+    x[n] = {in[n], V(0)};
+  for (int n = 0; n < count; n++) {
+    x[n].derivative = V(1);
+    grad[n] = f(x);
+    x[n].derivative = V(0);
+  }
+}
+
+// Replaces the adjoints of θ and the liquid fraction by those before melting; θ is that after G2P.
+template <class At, class T, int D>
+MPM_HD void pull_back_melting(const HeatToParticlesBackwardArguments<T, D>& a, const At& at, int scene,
+                              const typename At::Value& theta, typename At::Value& grad_theta) {
+  using V = typename At::Value;
+  using Melt = Applied<HeatMelt, D>;
+  const HeatToParticlesArguments<T, D>& f = a.forward;
+  const V in[] = {theta,
+                  load_scalar(at, f.particles.liquid),
+                  load_value(at, f.melting_point, scene),
+                  load_value(at, f.specific_heat, scene),
+                  load_value(at, f.latent_heat, scene),
+                  load_scalar(at, f.number)};
+  const V adjoint[] = {grad_theta, load_scalar(at, constant(a.liquid)), V(0)};
+  V grad[Melt::kIn];
+  Melt::pull_back(in, adjoint, [](int n) { return n < Melt::kIn - 1; }, [&](int n, const V& sum) { grad[n] = sum; });
+  grad_theta = grad[0];
+  store_scalar(at, a.liquid, grad[1]);
+  add_parameter(at, a.parameters, kMeltingPoint, grad[2]);
+  add_parameter(at, a.parameters, kSpecificHeat, grad[3]);
+  add_parameter(at, a.parameters, kLatentHeat, grad[4]);
+}
+
+// Adjoints of the inputs of `blended`; that of β is added.
+template <class V>
+struct BlendedAdjoint {
+  V increment, average, before;
+};
+
+template <class V>
+MPM_HD BlendedAdjoint<V> pull_back_blended(const V& increment, const V& average, const V& before, const V& blend,
+                                           const V& adjoint, V& by_blend) {
+  const V in[] = {increment, average, before, blend};
+  V grad[4];
+  pull_back(in, grad, 4, [&](const Dual<V>(&x)[4]) { return adjoint * blended(x[0], x[1], x[2], x[3]).derivative; });
+  by_blend = by_blend + grad[3];
+  return {grad[0], grad[1], grad[2]};
+}
+
+// Replaces the adjoint of the gradient after its transport by that before it; those of ∇v and dt are added.
+template <class At, class T, int D>
+MPM_HD void pull_back_transport(const HeatToParticlesBackwardArguments<T, D>& a, const At& at,
+                                const Vector<typename At::Value, D>& gradient, const typename At::Value& dt,
+                                Vector<typename At::Value, D>& adjoint) {
+  using V = typename At::Value;
+  V in[D + D * D + 1], grad[D + D * D + 1];
+  Writer<V, D> arguments{in};
+  arguments.put(gradient);
+  arguments.put(load_matrix<D>(at, a.forward.velocity_gradient));
+  arguments.put(dt);
+  pull_back(in, grad, a.dt.pointer ? D + D * D + 1 : D + D * D, [&](const Dual<V>(&x)[D + D* D + 1]) {
+    Reader<Dual<V>, D> read{x};
+    const Vector<Dual<V>, D> before = read.vector();
+    const Matrix<Dual<V>, D> L = read.matrix();
+    const Vector<Dual<V>, D> after = transported_gradient(before, L, read.scalar());
+    V sum = adjoint[0] * after[0].derivative;
+    MPM_UNROLL for (int d = 1; d < D; d++)
+      sum = sum + adjoint[d] * after[d].derivative;
+    return sum;
+  });
+  Reader<V, D> read{grad};
+  adjoint = read.vector();
+  store_matrix<D>(Adding<At>(at), a.velocity_gradient, read.matrix());
+  if (a.dt.pointer) add_scalar(at, a.dt, read.scalar());
+}
+
+// At particles inside the grid, from the increment and θ̄; the moments are times D⁻¹. Particles outside keep their
+// temperature, so that its adjoint is unchanged.
+template <bool Affine, class At, class T, int D>
+MPM_HD void heat_of_particles_backward(const HeatToParticlesBackwardArguments<T, D>& a, const At& at, int scene,
+                                       const typename At::Value& dt,
+                                       const HeatGathered<typename At::Value, D, 2>& gathered) {
+  using V = typename At::Value;
+  const HeatToParticlesArguments<T, D>& f = a.forward;
+  const V theta = load_scalar(at, f.particles.theta), blend = load_scalar(at, f.blend);
+  V by_theta = load_scalar(at, constant(a.theta)), by_blend(0);
+  if (a.liquid.pointer)
+    pull_back_melting(a, at, scene, blended(gathered.value[0], gathered.value[1], theta, blend), by_theta);
+  const BlendedAdjoint<V> by =
+      pull_back_blended(gathered.value[0], gathered.value[1], theta, blend, by_theta, by_blend);
+  store_scalar(at, entry(a.value, kHeatIncrement), by.increment);
+  store_scalar(at, entry(a.value, kHeatAverage), by.average);
+  store_scalar(at, a.theta, by.before);
+  if constexpr (Affine) {
+    const Vector<V, D> before = load_vector<D>(at, f.particles.gradient);
+    const auto &increment = gathered.moment[0], &average = gathered.moment[1];
+    Vector<V, D> after, adjoint = load_vector<D>(at, constant(a.gradient)), by_increment, by_average;
+    MPM_UNROLL for (int d = 0; d < D; d++)
+      after[d] = blended(increment[d], average[d], before[d], blend);
+    pull_back_transport(a, at, after, dt, adjoint);
+    MPM_UNROLL for (int d = 0; d < D; d++) {
+      const BlendedAdjoint<V> b = pull_back_blended(increment[d], average[d], before[d], blend, adjoint[d], by_blend);
+      by_increment[d] = b.increment, by_average[d] = b.average, adjoint[d] = b.before;
+    }
+    store_vector<D>(at, entry(a.moment, kHeatIncrement), V(T(f.moment_scale)) * by_increment);
+    store_vector<D>(at, entry(a.moment, kHeatAverage), V(T(f.moment_scale)) * by_average);
+    store_vector<D>(at, a.gradient, adjoint);
+  }
+  store_scalar(at, a.blend, by_blend);
+}
+
+// A term at a node of a block of a scene: the solve adds λ · (power − coefficient (θ + d)) to the adjoints.
+template <class T, int D>
+struct DualTerm {
+  const HeatTermBackwardArguments<T, D>& a;
+  Vector<Dual<T>, D> normal;
+  Dual<T> theta, first, second, reference;
+  T multiplier, after;
+
+  MPM_HD DualTerm(const HeatTermBackwardArguments<T, D>& arguments, int scene, int64_t i) : a(arguments) {
+    const HeatTermArguments<T, D>& f = a.forward;
+    const auto lifted = [](const T& value) { return Dual<T>{value, T(0)}; };
+    const Vector<T, D> at_node = normal_of_node(f, i);
+    MPM_UNROLL for (int d = 0; d < D; d++)
+      normal[d] = lifted(at_node[d]);
+    theta = lifted(f.theta[i]);
+    first = lifted(f.number[2 * int64_t(scene)]);
+    second = lifted(f.number[2 * int64_t(scene) + 1]);
+    reference = lifted(T(f.reference));
+    multiplier = a.multiplier[i];
+    after = f.theta[i] + a.sums[i * kHeatChannels + kHeatTheta];
+  }
+
+  // By one of the inputs.
+  MPM_HD T by(Dual<T>& input) const {
+    input.derivative = T(1);
+    const HeatRadiationAt<Dual<T>> linear = heat_of_term(a.forward.term, normal, theta, first, second, reference);
+    input.derivative = T(0);
+    return multiplier * (linear.power.derivative - after * linear.coefficient.derivative);
+  }
+};
+
+template <class T, int D>
+MPM_HD void heat_of_term_backward(const HeatTermBackwardArguments<T, D>& a, int scene, int64_t i) {
+  T* const surface = a.surface + i * kHeatChannels;
+  if (a.forward.term == HeatTerm::power) {
+    surface[0] += a.multiplier[i];
+    return;
+  }
+  DualTerm<T, D> term(a, scene, i);
+  MPM_UNROLL for (int d = 0; d < D; d++)
+    surface[1 + d] += term.by(term.normal[d]);
+  a.theta[i] += term.by(term.theta);
+}
+
+template <class T, int D>
+MPM_HD void heat_numbers_of_slot(const HeatNumbersBackwardArguments<T, D>& a, int scene, const int (&)[D],
+                                 int64_t slot) {
+  T first(0), second(0);
+  for (int64_t i = slot * kBlockNodes<D>; i < (slot + 1) * kBlockNodes<D>; i++) {
+    DualTerm<T, D> term(a.term, scene, i);
+    first += term.by(term.first);
+    second += term.by(term.second);
+  }
+  T* const to = a.to.sums + slot * a.to.columns + a.to.first;
+  to[0] = first;
+  to[1] = second;
+}
+
+// Increments lead from the averages to the held temperature, from which heat flows to the other nodes.
+template <class T, int D>
+MPM_HD void held_temperature_of_slot(const HeatHeldBackwardArguments<T, D>& a, int scene, const int (&corner)[D],
+                                     int64_t slot) {
+  const ObstaclePose<T, D> pose = pose_of(a.hold.contact, a.hold.obstacle, scene);
+  T sum(0);
+  for (int local = 0; pose.acts && local < kBlockNodes<D>; local++) {
+    const int64_t i = slot * kBlockNodes<D> + local;
+    if (!a.hold.fixed[i] || a.counted[i] || !is_held(a.hold, pose, corner, local)) continue;
+    a.counted[i] = true;
+    sum += a.adjoints[2 * i] - a.product[i];
+  }
+  a.to.sums[slot * a.to.columns + a.to.first] = sum;
+}
+
+template <class T, int D>
+MPM_HD void surface_temperature_of_slot(const HeatSurfaceTemperatureBackwardArguments<T, D>& a, int, const int (&)[D],
+                                        int64_t slot) {
+  T sum(0);
+  for (int64_t i = slot * kBlockNodes<D>; i < (slot + 1) * kBlockNodes<D>; i++) sum += a.multiplier[i] * a.exchange[i];
+  a.to.sums[slot * a.to.columns + a.to.first] = sum;
+}
+
+// At a node of a block of a scene.
+template <class T, int D>
+MPM_HD void heat_of_node_backward(const HeatNodesBackwardArguments<T, D>& a, int scene, int64_t i) {
+  using Means = Applied<HeatMeans<2>, D>;
+  const T step = step_of_scene(a.scene_dt, a.dt, scene);
+  const T dt = step > T(0) ? step : T(1);  // no system of a paused scene is solved: d and λ are zero
+  const T* const sum = a.sums + i * kHeatChannels;
+  const T capacity = sum[kHeatCapacity], varying = sum[kHeatVarying], increment = sum[kHeatTheta];
+  const T theta = a.theta[i], average = sum[kHeatMean], multiplier = a.multiplier[i],
+          rate = multiplier * increment / dt;
+  const T in[] = {capacity * theta, varying * average, capacity, varying};
+  T by_theta = -a.product[i];
+  if (a.exchange) by_theta -= a.exchange[i] * multiplier;
+  if (a.by_terms) by_theta += a.by_terms[i];
+  if (a.fixed && a.fixed[i]) by_theta = -a.adjoints[2 * i];  // the increment leads to the held temperature
+  const T adjoint[] = {-rate, T(0), by_theta, a.adjoints[2 * i + 1]};
+  T grad[Means::kIn];
+  Means::pull_back(in, adjoint, [](int) { return true; }, [&](int n, const T& value) { grad[n] = value; });
+  T* const form = a.forms + i * kHeatForms;
+  form[kHeatTheta] = grad[0];
+  form[kHeatMean] = grad[1];
+  form[kHeatCapacity] = grad[2];
+  form[kHeatVarying] = grad[3];
+  form[kHeatIncrement] = increment;
+  form[kHeatAverage] = average;
+  form[kHeatAfter] = theta + increment;
+  form[kHeatMultiplier] = multiplier;
+  if (a.rate) a.rate[i] = rate / dt;
+  if (a.layer) a.layer[i] = multiplier * (a.temperature[scene * a.stride] - (theta + increment));
+}
+
+// Adjoint of κ V by λ · H (θ + d) = Σ_p κ V ∇(θ + d) · ∇λ, which the equation of the solve subtracts; the gradients in
+// the moments become the factors of the forms.
+template <class At, class T, int D>
+MPM_HD typename At::Value pull_back_conduction(const HeatToNodesBackwardArguments<T, D>& a, const At& at,
+                                               const typename At::Value& conductance) {
+  using V = typename At::Value;
+  const Field<T> after = entry(a.moment, kHeatAfter), multiplier = entry(a.moment, kHeatMultiplier);
+  const Vector<V, D> of_after = load_vector<D>(at, constant(after)),
+                     of_multiplier = load_vector<D>(at, constant(multiplier));
+  const V scale = -(V(T(a.inverse_inertia)) * conductance);
+  store_vector<D>(at, after, scale * of_multiplier);
+  store_vector<D>(at, multiplier, scale * of_after);
+  return -dot(of_after, of_multiplier);
+}
+
+// Signed distance of a particle from the held surface, and its derivative along an axis: that of a surface which moves
+// the other way.
+template <class T, int D>
+MPM_HD Dual<T> distance_along(const HeatLayersArguments<T, D>& a, int scene, const Vector<T, D>& x, int axis) {
+  using S = Dual<T>;
+  const ObstacleRow<T, D>& row = rows_of_scene(a.contact, scene)[a.obstacle];
+  ObstacleRow<S, D> moved;
+  const T* const values = reinterpret_cast<const T*>(&row);
+  S* const lifted = reinterpret_cast<S*>(&moved);
+  for (int k = 0; k < ObstacleRow<T, D>::width; k++) lifted[k] = S(values[k], T(0));
+  moved.position[axis].derivative = T(-1);
+  return distance_from(obstacle_pose(a.contact, a.contact.kind[a.obstacle], moved, scene), x);
+}
+
+// At any particle: its conductance κ V, of which a share remains and another is exchanged, and its distance.
+template <class T, int D>
+MPM_HD void heat_layer_backward(const HeatLayersBackwardArguments<T, D>& a, int64_t p) {
+  const One<T> at{p};
+  const Vector<T, D> after = load_vector<D>(at, entry(a.moment, kHeatAfter)), x = load_vector<D>(at, a.layers.x);
+  const T by_rest = -dot(after, load_vector<D>(at, entry(a.moment, kHeatMultiplier)));
+  const T by_exchange = load_scalar(at, a.exchange) - by_rest / T(a.layers.inverse_inertia);
+  const int scene = scene_of_particle(a.layers, p);
+  const T distance = distance_from(pose_of(a.layers.contact, a.layers.obstacle, scene), x), width = T(a.layers.width);
+  store_scalar(at, a.conductance, by_rest);
+  store_vector<D>(at, a.x, zero_vector<T, D>());
+  if (distance >= width || (by_rest == T(0) && by_exchange == T(0))) return;  // the latter outside the grid
+  const HeatLayerAt<Dual<T>> layer = heat_layer(Dual<T>(distance, T(1)), Dual<T>(width, T(0)));
+  store_scalar(at, a.conductance, layer.share.value * by_rest + layer.rate.value * by_exchange);
+  const HeatToNodesArguments<T, D>& f = a.down;
+  const T conductance = heat_weights(load_scalar(at, f.particles.volume), load_value(at, f.specific_heat, scene),
+                                     load_value(at, f.conductivity, scene), load_scalar(at, f.mass),
+                                     step_of_scene(f.scene_dt, f.dt, scene), T(0), f.topology.geometry.dx)
+                            .conductance;
+  const T by_distance = conductance * (layer.share.derivative * by_rest + layer.rate.derivative * by_exchange);
+  Vector<T, D> grad;
+  for (int i = 0; i < D; i++) grad[i] = by_distance * distance_along(a.layers, scene, x, i).derivative;
+  store_vector<D>(at, a.x, grad);
+}
+
+// Power of a particle by the energy that its law dissipates.
+struct HeatOfDissipation {
+  static constexpr const char* name = "heat_of_dissipation";
+  static constexpr Entries arguments[] = {kScalar, kScalar, kScalar};
+  static constexpr Entries results[] = {kScalar};
+
+  template <class T, int D>
+  MPM_HD static void evaluate(Reader<T, D>& in, Writer<T, D>& out) {
+    const T energy = in.scalar(), rest = in.scalar();
+    out.put(dissipated_power(energy, rest, in.scalar()));
+  }
+};
+
+// Adjoint of the present volume by the free surface and by heat from inside the matter; the gathered adjoints become
+// the factors of the forms of the sums.
+template <class At, class T, int D>
+MPM_HD typename At::Value pull_back_surface(const HeatToNodesBackwardArguments<T, D>& a, const At& at, int scene,
+                                            const typename At::Value& volume, const typename At::Value& dt) {
+  using V = typename At::Value;
+  using Dissipation = Applied<HeatOfDissipation, D>;
+  const HeatSurfaceArguments<T, D>& f = a.surface;
+  const V by_power = load_scalar(at, entry(constant(a.surface_value), 0));
+  V by_volume(0), power(0);
+  MPM_UNROLL for (int k = 0; k <= D; k++) {
+    Vector<V, D> factor = load_vector<D>(at, entry(constant(a.surface_gradient), k));
+    MPM_UNROLL for (int d = 0; d < D; d++) {
+      if (1 + d == k) by_volume = by_volume + factor[d];
+      factor[d] = 1 + d == k ? volume : V(0);
+    }
+    store_vector<D>(at, entry(a.surface_gradient, k), factor);
+  }
+  if (f.power.pointer) {
+    const V density = load_value(at, f.power, scene);
+    by_volume = by_volume + density * by_power;
+    power = density * volume;
+    add_parameter(at, a.parameters, kPower, volume * by_power);
+  }
+  if (f.dissipated.pointer) {
+    const V in[] = {V(T(f.share)) * load_scalar(at, f.dissipated), load_scalar(at, f.rest), dt}, adjoint[] = {by_power};
+    V out[1], grad[3];
+    Dissipation::evaluate(in, out);
+    power = power + out[0];
+    Dissipation::pull_back(in, adjoint, [](int) { return true; }, [&](int n, const V& sum) { grad[n] = sum; });
+    store_scalar(at, a.dissipated, V(T(f.share)) * grad[0]);
+    add_scalar(at, a.volume, grad[1]);
+    add_scalar(at, a.dt, grad[2]);
+  }
+  store_scalar(at, entry(a.surface_value, 0), power);
+  MPM_UNROLL for (int k = 1; k <= D; k++)
+    store_scalar(at, entry(a.surface_value, k), V(0));
+  return by_volume;
+}
+
+// Adjoints of what P2G adds to the sums of the nodes: those of θ and its gradient are added, and the factors of the
+// forms stored; returns those of the heat capacity and of β.
+template <class At, class T, int D>
+MPM_HD HeatWeights<typename At::Value> pull_back_sums(
+    const HeatToNodesBackwardArguments<T, D>& a, const At& at, const HeatWeights<typename At::Value>& weights,
+    const HeatGathered<typename At::Value, D, kHeatChannels>& gathered) {
+  using V = typename At::Value;
+  const HeatToNodesArguments<T, D>& f = a.forward;
+  const bool affine = f.particles.gradient.pointer;
+  const Vector<V, D> slope = affine ? load_vector<D>(at, f.particles.gradient) : zero_vector<V, D>();
+  V in[3 + D], grad[3 + D];
+  Writer<V, D> arguments{in};
+  arguments.put(weights.capacity);
+  arguments.put(weights.blend);
+  arguments.put(load_scalar(at, f.particles.theta));
+  arguments.put(slope);
+  const HeatSums<V> sums = heat_sums(weights, in[2]);
+  store_scalar(at, entry(a.value, kHeatCapacity), sums.capacity);
+  store_scalar(at, entry(a.value, kHeatVarying), sums.varying);
+  store_scalar(at, entry(a.value, kHeatTheta), sums.theta);
+  store_scalar(at, entry(a.value, kHeatMean), sums.mean);
+  pull_back(in, grad, affine ? 3 + D : 3, [&](const Dual<V>(&x)[3 + D]) {
+    HeatWeights<Dual<V>> w{};
+    w.capacity = x[0];
+    w.blend = x[1];
+    const HeatSums<Dual<V>> value = heat_sums(w, x[2]);
+    V sum = gathered.value[kHeatCapacity] * value.capacity.derivative +
+            gathered.value[kHeatVarying] * value.varying.derivative +
+            gathered.value[kHeatTheta] * value.theta.derivative + gathered.value[kHeatMean] * value.mean.derivative;
+    MPM_UNROLL for (int d = 0; d < D; d++) {
+      const HeatSums<Dual<V>> moment = heat_sums(w, x[3 + d]);
+      sum = sum + gathered.moment[kHeatTheta][d] * moment.theta.derivative +
+            gathered.moment[kHeatMean][d] * moment.mean.derivative;
+    }
+    return sum;
+  });
+  add_scalar(at, a.theta, grad[2]);
+  if (affine) {
+    Vector<V, D> of_theta, of_mean, by_slope;
+    MPM_UNROLL for (int d = 0; d < D; d++) {
+      const HeatSums<V> moment = heat_sums(weights, slope[d]);
+      of_theta[d] = moment.theta, of_mean[d] = moment.mean, by_slope[d] = grad[3 + d];
+    }
+    store_vector<D>(at, entry(a.moment, kHeatTheta), of_theta);
+    store_vector<D>(at, entry(a.moment, kHeatMean), of_mean);
+    store_vector<D>(Adding<At>(at), a.gradient, by_slope);
+  }
+  HeatWeights<V> by{};
+  by.capacity = grad[0];
+  by.blend = grad[1];
+  return by;
+}
+
+// Adjoints of the rest volume, and of J or F, by the present volume.
+template <class At, class T, int D>
+MPM_HD void pull_back_volume(const HeatToNodesBackwardArguments<T, D>& a, const At& at,
+                             const typename At::Value& by_volume) {
+  using V = typename At::Value;
+  V in[1 + D * D], grad[1 + D * D];
+  Writer<V, D> arguments{in};
+  arguments.put(load_scalar(at, a.rest));
+  Matrix<V, D> by_F = zero_matrix<V, D>();
+  if (a.J.pointer) {
+    arguments.put(load_scalar(at, a.J));
+    pull_back(in, grad, 2, [&](const Dual<V>(&x)[1 + D* D]) { return by_volume * (x[0] * x[1]).derivative; });
+    store_scalar(at, a.J_term, grad[1]);
+  } else if (a.F.pointer) {
+    arguments.put(load_matrix<D>(at, a.F));
+    pull_back(in, grad, 1 + D * D, [&](const Dual<V>(&x)[1 + D* D]) {
+      Reader<Dual<V>, D> read{x + 1};
+      return by_volume * (x[0] * determinant(read.matrix())).derivative;
+    });
+    Reader<V, D> read{grad + 1};
+    by_F = read.matrix();
+  } else {
+    grad[0] = by_volume;
+  }
+  if (a.F_term.pointer) store_matrix<D>(at, a.F_term, by_F);
+  add_scalar(at, a.volume, grad[0]);
+}
+
+// At particles inside the grid, from the adjoints of the sums.
+template <class At, class T, int D>
+MPM_HD void heat_of_nodes_backward(const HeatToNodesBackwardArguments<T, D>& a, const At& at, int scene,
+                                   const typename At::Value& dt,
+                                   const HeatGathered<typename At::Value, D, kHeatChannels>& gathered) {
+  using V = typename At::Value;
+  constexpr int scalars = 5, inputs = scalars + D * D;
+  const HeatToNodesArguments<T, D>& f = a.forward;
+  const V volume = load_scalar(at, f.particles.volume), dx(f.topology.geometry.dx);
+  V in[inputs], grad[inputs];
+  Writer<V, D> arguments{in};
+  arguments.put(volume);
+  arguments.put(load_value(at, f.specific_heat, scene));
+  arguments.put(load_value(at, f.conductivity, scene));
+  arguments.put(load_scalar(at, f.mass));
+  arguments.put(dt);
+  const Matrix<V, D> L = load_matrix<D>(at, f.velocity_gradient);
+  arguments.put(L);
+  HeatWeights<V> weights = heat_weights(in[0], in[1], in[2], in[3], in[4], strain_rate_of(L), dx);
+  weights.blend = blend_of(f.transfer, weights.blend);
+
+  HeatWeights<V> by = pull_back_sums(a, at, weights, gathered);
+  by.blend = by.blend + load_scalar(at, a.blend);
+  const V by_rest = pull_back_conduction(a, at, load_scalar(at, constant(f.conductance)));
+  by.conductance = a.conductance.pointer ? load_scalar(at, a.conductance) : by_rest;
+  const V by_volume = a.surface_value.pointer ? pull_back_surface(a, at, scene, volume, dt) : V(0);
+  if (a.rate.pointer) add_scalar(at, a.dt, weights.capacity * load_scalar(at, a.rate));
+  const bool varies = f.transfer == HeatTransfer::hybrid;  // else β is constant
+  pull_back(in, grad, varies ? inputs : scalars, [&](const Dual<V>(&x)[inputs]) {
+    Reader<Dual<V>, D> read{x + scalars};
+    const HeatWeights<Dual<V>> w =
+        heat_weights(x[0], x[1], x[2], x[3], x[4], strain_rate_of(read.matrix()), Dual<V>(dx, V(0)));
+    const V sum = by.capacity * w.capacity.derivative + by.conductance * w.conductance.derivative;
+    return varies ? sum + by.blend * w.blend.derivative : sum;
+  });
+  pull_back_volume(a, at, by_volume + grad[0]);
+  add_parameter(at, a.parameters, kSpecificHeat, grad[1]);
+  add_parameter(at, a.parameters, kConductivity, grad[2]);
+  add_scalar(at, a.mass, grad[3]);
+  add_scalar(at, a.dt, grad[4]);
+  Reader<V, D> read{grad + scalars};
+  if (varies) store_matrix<D>(Adding<At>(at), a.velocity_gradient, read.matrix());
+}
+
+// A particle outside the grid takes no part.
+template <class T, int D>
+MPM_HD void skip_heat_of_nodes_backward(const HeatToNodesBackwardArguments<T, D>& a, int64_t p) {
+  const One<T> at{p};
+  if (a.dissipated.pointer) store_scalar(at, a.dissipated, T(0));
+  if (a.J_term.pointer) store_scalar(at, a.J_term, T(0));
+  if (a.F_term.pointer) store_matrix<D>(at, a.F_term, zero_matrix<T, D>());
+}
+
+}  // namespace TORCH_MPM_ISA
+}  // namespace mpm

@@ -1,0 +1,374 @@
+#pragma once
+
+#include <algorithm>
+
+#include "rollout/recorded.h"
+
+// Adjoint of the conduction of heat in the steps of a record, the last step first.
+namespace mpm {
+
+// Adjoints of the heat of the particles, and sums of other adjoints that it adds to; absent ones are undefined.
+struct HeatAdjoints {
+  Tensor state;       // [P, m] in the order of the record
+  Tensor parameters;  // [P, kHeatParameters]
+  Tensor velocity_gradient, mass, volume, dt;
+  Tensor boundaries;  // [B, m]: of both numbers of each term, and of the temperatures of the held obstacles
+  Tensor status;      // [B, kHeatStatusSize] of the adjoint solves, as that of the solves of a call
+};
+
+template <class T, int D>
+class HeatBackward {
+ public:
+  Tensor x_term, F_term, J_term;  // adjoints of the particles before the step, from its heat
+  Tensor dissipated;              // adjoint of the energy that its laws dissipate, undefined where none becomes heat
+
+  HeatBackward(Recorded<T, D>& record, const SubstepsInputs& in, backend::Stream stream);
+
+  // Step i, to which the record has returned. The adjoints after the step become those before it.
+  void run(int64_t i, const HeatAdjoints& adjoints) {
+    const HeatSolution<T, D> solution = record_.conduct_again(i);
+    make_nodes(solution);
+    HeatToParticlesBackwardArguments<T, D> up = to_particles(solution, adjoints);
+    backend::heat_to_particles_backward(order(), up, stream_);
+    scatter(up);
+    solve(solution.system, adjoints.status);
+    if (heat().has_terms()) adjoint_of_terms(solution);
+    if (adjoints.boundaries.defined()) adjoint_of_boundaries(solution, adjoints.boundaries);
+    adjoint_of_nodes(solution, adjoints.dt.defined());
+    gather(solution.down, adjoints.dt.defined());
+    if (heat().holds_surface()) adjoint_of_layers(solution.down);
+    backend::heat_to_nodes_backward(order(), to_nodes(i, solution.down, adjoints), stream_);
+    position_gradient(solution.down);
+  }
+
+ private:
+  int64_t order() const { return in_.lattice.order(); }
+  T* rows(const Tensor& t) const { return static_cast<T*>(t.data_ptr()); }
+  HeatSteps<T, D>& heat() const { return *record_.heat; }
+  // Forms from `first` on.
+  static Field<T> forms(const Tensor& t, int first) {
+    Field<T> f = field<T>(t);
+    f.pointer += first * f.stride[1];
+    return f;
+  }
+
+  void make_nodes(const HeatSolution<T, D>& solution);
+  HeatToParticlesBackwardArguments<T, D> to_particles(const HeatSolution<T, D>& solution, const HeatAdjoints& adjoints);
+  void scatter(const HeatToParticlesBackwardArguments<T, D>& up);
+  void solve(HeatArguments<T, D> system, const Tensor& status);
+  HeatTermBackwardArguments<T, D> term_backward(const HeatSolution<T, D>& solution,
+                                                const HeatTermArguments<T, D>& term) const;
+  void adjoint_of_terms(const HeatSolution<T, D>& solution);
+  void adjoint_of_boundaries(const HeatSolution<T, D>& solution, const Tensor& sums);
+  void adjoint_of_surface_temperature(const HeatSolution<T, D>& solution, const HeatSlotSums<T>& to);
+  void adjoint_of_layers(const HeatToNodesArguments<T, D>& down);
+  void adjoint_of_nodes(const HeatSolution<T, D>& solution, bool by_dt);
+  void gather(const HeatToNodesArguments<T, D>& down, bool by_dt);
+  HeatToNodesBackwardArguments<T, D> to_nodes(int64_t i, const HeatToNodesArguments<T, D>& down,
+                                              const HeatAdjoints& adjoints) const;
+  void position_gradient(const HeatToNodesArguments<T, D>& down);
+
+  Recorded<T, D>& record_;
+  const SubstepsInputs& in_;
+  backend::Stream stream_;
+  Tensor value_, moment_, blend_, rate_of_particles_;  // [P, kHeatForms], [P, kHeatForms, D], [P], [P, 1]
+  int64_t nodes_ = -1;
+  Tensor adjoints_, source_, multiplier_, product_, forms_, rate_;  // of the nodes
+  Tensor slot_sums_, counted_;  // of the numbers of the boundary, by slots; nodes that are held
+  // Adjoints of the sums of the free surface, and of θ by the terms; [P, 1 + D], [P, 1 + D, D].
+  Tensor surface_, by_terms_, surface_value_, surface_gradient_;
+  // Of a held surface: adjoint of the exchange of the nodes, and gathered [P, 1]; of κ V [P], and of x [P, D].
+  Tensor layer_, layer_exchange_, layer_of_particles_, by_conductance_, x_layer_;
+  Tensor iterations_, residual_, converged_, workspace_, operator_workspace_;
+};
+
+template <class T, int D>
+HeatBackward<T, D>::HeatBackward(Recorded<T, D>& record, const SubstepsInputs& in, backend::Stream stream)
+    : record_(record), in_(in), stream_(stream) {
+  const Tensor& x = in.x;
+  const int64_t P = x.size(0);
+  x_term = empty_particles(x, {P, D});
+  F_term = result(x, has(in.F), {P, D, D});
+  J_term = result(x, has(in.J), {P});
+  value_ = empty_particles(x, {P, kHeatForms});
+  moment_ = empty_particles(x, {P, kHeatForms, D});
+  torch::stable::zero_(value_);  // some forms have no values, and some no moments
+  torch::stable::zero_(moment_);
+  blend_ = empty(x, {P});
+  dissipated = result(x, heat().heats_by_laws(), {P});
+  layer_of_particles_ = result(x, heat().holds_surface(), {P, 1});
+  by_conductance_ = result(x, heat().holds_surface(), {P});
+  x_layer_ = result(x, heat().holds_surface(), {P, D});
+  surface_value_ = result(x, heat().has_terms(), {P, 1 + D});
+  surface_gradient_ = result(x, heat().has_terms(), {P, 1 + D, D});
+  iterations_ = empty_int(x, {in.scenes});
+  residual_ = empty(x, {in.scenes});
+  converged_ = empty(x, {in.scenes}, ScalarType::Bool);
+}
+
+template <class T, int D>
+void HeatBackward<T, D>::make_nodes(const HeatSolution<T, D>& solution) {
+  const int64_t nodes = int64_t(solution.system.topology.max_blocks) * kBlockNodes<D>;
+  if (nodes == nodes_) return;
+  nodes_ = nodes;
+  for (Tensor* t : {&source_, &multiplier_, &product_, &rate_}) *t = empty(in_.x, {nodes});
+  adjoints_ = empty(in_.x, {nodes, 2});
+  forms_ = empty(in_.x, {nodes, kHeatForms});
+  if (heat().holds_surface()) layer_ = empty(in_.x, {nodes});
+  if (heat().has_terms()) surface_ = empty(in_.x, {nodes, kHeatChannels}), by_terms_ = empty(in_.x, {nodes});
+  workspace_ = operator_workspace_ = Tensor();
+}
+
+template <class T, int D>
+HeatToParticlesBackwardArguments<T, D> HeatBackward<T, D>::to_particles(const HeatSolution<T, D>& solution,
+                                                                        const HeatAdjoints& adjoints) {
+  HeatToParticlesBackwardArguments<T, D> a;
+  a.forward = heat().to_particles(solution.down);
+  a.theta = HeatSteps<T, D>::column_of(adjoints.state, 0);
+  a.gradient = HeatSteps<T, D>::column_of(adjoints.state, heat().gradient_column());
+  a.liquid = HeatSteps<T, D>::column_of(adjoints.state, heat().liquid_column());
+  a.value = field<T>(value_);
+  a.moment = field<T>(moment_);
+  a.blend = field<T>(blend_);
+  a.velocity_gradient = field<T>(adjoints.velocity_gradient);
+  a.parameters = field<T>(adjoints.parameters);
+  a.dt = field<T>(adjoints.dt);
+  return a;
+}
+
+// Adjoints of the increments and of θ̄.
+template <class T, int D>
+void HeatBackward<T, D>::scatter(const HeatToParticlesBackwardArguments<T, D>& up) {
+  backend::clear(adjoints_, stream_);
+  ScatterArguments<T, D> a;
+  a.topology = up.forward.topology;
+  a.x = up.forward.x;
+  a.value = constant(forms(value_, kHeatIncrement));
+  if (up.gradient.pointer) a.moment = constant(forms(moment_, kHeatIncrement));
+  a.deterministic = in_.lattice.deterministic();
+  a.nodes = {rows(adjoints_), 2, 2};
+  backend::scatter(order(), a, stream_);
+  torch::stable::copy_(source_, torch::stable::select(adjoints_, 1, 0));
+}
+
+// λ of A λ = adjoint of the increment, and H λ.
+template <class T, int D>
+void HeatBackward<T, D>::solve(HeatArguments<T, D> system, const Tensor& status) {
+  system.theta = nullptr;
+  system.source = rows(source_);
+  system.tolerance = 0;
+  system.relative_tolerance = in_.heat_scalars[3];
+  system.increment = rows(multiplier_);
+  system.iterations = static_cast<int*>(iterations_.data_ptr());
+  system.residual = rows(residual_);
+  system.converged = static_cast<bool*>(converged_.data_ptr());
+  if (!workspace_.defined()) workspace_ = empty(in_.x, {backend::heat_workspace(system, stream_)}, ScalarType::Byte);
+  system.workspace = workspace_.data_ptr();
+  backend::heat_cg(order(), system, stream_);
+  backend::heat_count(HeatCountArguments<T, D>{in_.scenes, system.converged, system.residual, system.scene_dt,
+                                               static_cast<double*>(status.data_ptr())},
+                      stream_);
+
+  backend::clear(product_, stream_);
+  HeatOperatorArguments<T, D> a;
+  a.topology = system.topology;
+  a.x = system.x;
+  a.conductance = system.conductance;
+  a.nodes = rows(multiplier_);
+  a.deterministic = system.deterministic;
+  a.sum = rows(product_);
+  if (!operator_workspace_.defined())
+    operator_workspace_ = empty(in_.x, {backend::heat_operator_workspace(a, stream_)}, ScalarType::Byte);
+  a.workspace = operator_workspace_.data_ptr();
+  backend::heat_operator(order(), a, stream_);
+}
+
+template <class T, int D>
+HeatTermBackwardArguments<T, D> HeatBackward<T, D>::term_backward(const HeatSolution<T, D>& solution,
+                                                                  const HeatTermArguments<T, D>& term) const {
+  return {term, solution.down.sums.pointer, rows(multiplier_), rows(surface_), rows(by_terms_)};
+}
+
+template <class T, int D>
+void HeatBackward<T, D>::adjoint_of_terms(const HeatSolution<T, D>& solution) {
+  backend::clear(surface_, stream_);
+  backend::clear(by_terms_, stream_);
+  for (const HeatTermArguments<T, D>& term : heat().terms())
+    backend::heat_term_backward(term_backward(solution, term), stream_);
+}
+
+// Adds the adjoints of the numbers of the boundary to their sums.
+template <class T, int D>
+void HeatBackward<T, D>::adjoint_of_boundaries(const HeatSolution<T, D>& solution, const Tensor& sums) {
+  const Topology<T, D>& t = solution.system.topology;
+  const int columns = int(sums.size(1));
+  slot_sums_ = empty(in_.x, {int64_t(t.max_blocks), columns});
+  backend::clear(slot_sums_, stream_);
+  HeatSlotSums<T> to{rows(slot_sums_), columns, 0};
+  if (heat().has_terms())
+    for (const HeatTermArguments<T, D>& term : heat().terms()) {
+      if (term.term == HeatTerm::power) continue;
+      backend::heat_numbers_backward(HeatNumbersBackwardArguments<T, D>{term_backward(solution, term), to}, stream_);
+      to.first += 2;
+    }
+  if (heat().held_nodes() > 0) {
+    counted_ = empty(in_.x, {nodes_}, ScalarType::Bool);
+    backend::clear(counted_, stream_);
+  }
+  for (int64_t k = 0; k < heat().held_nodes(); k++, to.first++)
+    backend::heat_held_backward(
+        HeatHeldBackwardArguments<T, D>{heat().hold(k, solution.system.heat_capacity), rows(adjoints_), rows(product_),
+                                        static_cast<bool*>(counted_.data_ptr()), to},
+        stream_);
+  if (heat().holds_surface()) adjoint_of_surface_temperature(solution, to);
+  backend::sum_slots(SumSlotsArguments<T, D>{{t.max_blocks, t.geometry.blocks_per_scene, t.block, int(in_.scenes),
+                                              columns, in_.scenes > 1, rows(slot_sums_), rows(sums), columns}},
+                     stream_);
+}
+
+template <class T, int D>
+void HeatBackward<T, D>::adjoint_of_surface_temperature(const HeatSolution<T, D>& solution, const HeatSlotSums<T>& to) {
+  layer_exchange_ = empty(in_.x, {nodes_});
+  backend::clear(layer_exchange_, stream_);
+  ScatterArguments<T, D> a;
+  a.topology = solution.down.topology;
+  a.x = solution.down.x;
+  a.value = field<const T>(heat().exchange_of_particles());
+  a.deterministic = in_.lattice.deterministic();
+  a.nodes = {rows(layer_exchange_), 1, 1};
+  backend::scatter(order(), a, stream_);
+  backend::heat_surface_temperature_backward(
+      HeatSurfaceTemperatureBackwardArguments<T, D>{a.topology, rows(multiplier_), rows(layer_exchange_), to}, stream_);
+}
+
+template <class T, int D>
+void HeatBackward<T, D>::adjoint_of_nodes(const HeatSolution<T, D>& solution, bool by_dt) {
+  HeatNodesBackwardArguments<T, D> a;
+  a.topology = solution.system.topology;
+  a.sums = solution.down.sums.pointer;
+  a.theta = solution.theta;
+  a.multiplier = rows(multiplier_);
+  a.product = rows(product_);
+  a.adjoints = rows(adjoints_);
+  a.exchange = solution.system.exchange;
+  if (heat().has_terms()) a.by_terms = rows(by_terms_);
+  a.fixed = solution.system.fixed;
+  if (heat().holds_surface()) {
+    const HeatFromSurfaceArguments<T, D> held = heat().from_surface();
+    a.temperature = held.temperature;
+    a.stride = held.stride;
+    a.layer = rows(layer_);
+  }
+  a.scene_dt = solution.down.scene_dt;
+  a.dt = solution.down.dt;
+  a.forms = rows(forms_);
+  if (by_dt) a.rate = rows(rate_);
+  backend::heat_nodes_backward(a, stream_);
+}
+
+// ∇(θ + d) and ∇λ at the particles, the adjoints of their shares of the free surface, and the mean of λ d/dt² for the
+// adjoint of dt.
+template <class T, int D>
+void HeatBackward<T, D>::gather(const HeatToNodesArguments<T, D>& down, bool by_dt) {
+  GatherArguments<T, D> a;
+  a.topology = down.topology;
+  a.x = down.x;
+  a.nodes = {rows(forms_) + kHeatAfter, kHeatForms, 2};
+  a.moment_scale = in_.lattice.inverse_inertia();
+  a.moment = forms(moment_, kHeatAfter);
+  backend::gather(order(), a, stream_);
+  a.moment = {};
+  if (heat().has_terms()) {
+    a.nodes = {rows(surface_), kHeatChannels, 1 + D};
+    a.value = field<T>(surface_value_);
+    a.gradient = field<T>(surface_gradient_);
+    backend::gather(order(), a, stream_);
+    a.gradient = {};
+  }
+  if (!by_dt) return;
+  if (!rate_of_particles_.defined()) rate_of_particles_ = empty_particles(in_.x, {in_.x.size(0), 1});
+  a.nodes = {rows(rate_), 1, 1};
+  a.value = field<T>(rate_of_particles_);
+  backend::gather(order(), a, stream_);
+}
+
+template <class T, int D>
+HeatToNodesBackwardArguments<T, D> HeatBackward<T, D>::to_nodes(int64_t i, const HeatToNodesArguments<T, D>& down,
+                                                                const HeatAdjoints& adjoints) const {
+  const Particles<const T> before = record_.state(i);
+  HeatToNodesBackwardArguments<T, D> a;
+  a.forward = down;
+  a.rest = record_.steps.p2g.volume;
+  a.F = before.F;
+  a.J = before.J;
+  a.nodes = {rows(forms_), kHeatForms, kHeatChannels};
+  a.blend = field<const T>(blend_);
+  if (adjoints.dt.defined()) a.rate = constant(HeatSteps<T, D>::column_of(rate_of_particles_, 0));
+  a.inverse_inertia = in_.lattice.inverse_inertia();
+  if (heat().has_terms()) a.surface = heat().surface(before.x, a.rest);
+  a.conductance = field<const T>(by_conductance_);
+  a.surface_value = field<T>(surface_value_);
+  a.surface_gradient = field<T>(surface_gradient_);
+  a.dissipated = field<T>(dissipated);
+  a.value = field<T>(value_);
+  a.moment = field<T>(moment_);
+  a.theta = HeatSteps<T, D>::column_of(adjoints.state, 0);
+  a.gradient = HeatSteps<T, D>::column_of(adjoints.state, heat().gradient_column());
+  a.velocity_gradient = field<T>(adjoints.velocity_gradient);
+  a.mass = field<T>(adjoints.mass);
+  a.volume = field<T>(adjoints.volume);
+  a.parameters = field<T>(adjoints.parameters);
+  a.dt = field<T>(adjoints.dt);
+  a.F_term = field<T>(F_term);
+  a.J_term = field<T>(J_term);
+  return a;
+}
+
+// Particles around the held surface: their exchange at the nodes, the rest of their conductance and their distance.
+template <class T, int D>
+void HeatBackward<T, D>::adjoint_of_layers(const HeatToNodesArguments<T, D>& down) {
+  GatherArguments<T, D> gather;
+  gather.topology = down.topology;
+  gather.x = down.x;
+  gather.nodes = {rows(layer_), 1, 1};
+  gather.value = field<T>(layer_of_particles_);
+  backend::gather(order(), gather, stream_);
+  HeatLayersBackwardArguments<T, D> a;
+  a.down = down;
+  a.layers = heat().layers(down.x, record_.scene_of_particles());
+  a.exchange = constant(HeatSteps<T, D>::column_of(layer_of_particles_, 0));
+  a.moment = field<const T>(moment_);
+  a.conductance = field<T>(by_conductance_);
+  a.x = field<T>(x_layer_);
+  backend::heat_layers_backward(a, stream_);
+}
+
+// Of all forms: those of the step at once, those of the free surface, and that of the exchange of a held surface.
+template <class T, int D>
+void HeatBackward<T, D>::position_gradient(const HeatToNodesArguments<T, D>& down) {
+  PositionGradientArguments<T, D> a;
+  a.topology = down.topology;
+  a.x = down.x;
+  a.value = field<const T>(value_);
+  a.moment = field<const T>(moment_);
+  a.nodes = {rows(forms_), kHeatForms, kHeatForms};
+  a.position_gradient = field<T>(x_term);
+  backend::position_gradient(order(), a, stream_);
+  a.moment = {};
+  a.adds = true;
+  if (heat().holds_surface()) {
+    a.value = field<const T>(heat().exchange_of_particles());
+    a.nodes = {rows(layer_), 1, 1};
+    backend::position_gradient(order(), a, stream_);
+    const Field<T> sum = field<T>(x_term);
+    backend::add_scaled(AddScaledArguments<T, D>{in_.x.size(0), sum, constant(sum), field<const T>(x_layer_), 1},
+                        stream_);
+  }
+  if (!heat().has_terms()) return;
+  a.value = field<const T>(surface_value_);
+  a.gradient = field<const T>(surface_gradient_);
+  a.nodes = {rows(surface_), kHeatChannels, 1 + D};
+  backend::position_gradient(order(), a, stream_);
+}
+
+}  // namespace mpm

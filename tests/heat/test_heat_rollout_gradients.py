@@ -1,0 +1,402 @@
+"""Gradients of heat in rollouts of the fused op, against single steps composed of ops."""
+
+import copy
+import random
+
+import pytest
+import torch
+from heat_scenes import DT, LAWS, THERMAL, TRANSFERS, bodies, composed, held, scene, terms, thermal
+from pairs import in_pairs
+
+import torch_mpm as mpm
+from torch_mpm import heat_boundaries
+from torch_mpm.laws.parameters import PerMaterial
+from torch_mpm.rollouts import plan_rollout
+from torch_mpm.rollouts.budget import bytes_of_a_substep
+
+F64 = torch.float64
+STATE = ("x", "v", "C", "F", "J", "mass", "volume", "temperature")
+PARAMETERS = ("conductivity", "specific_heat", "melting_point", "latent_heat")
+
+
+def melting(state):
+    """A state with particles that melt or freeze from the first step on."""
+    if "liquid" not in state.extra:
+        return state
+    part = torch.arange(len(state), device=state.x.device) % 3 != 0
+    share = torch.linspace(0.2, 0.8, len(state), dtype=state.x.dtype, device=state.x.device)
+    return state.replace(extra=state.extra | {"liquid": torch.where(part, share, state.extra["liquid"])})
+
+
+def with_leaves(step, state):
+    """The state with leaves in the place of its tensors, and all leaves by name; sets those of the parameters."""
+    leaves = {name: t for name in STATE if (t := getattr(state, name)) is not None} | state.extra
+    leaves = {name: t.detach().clone().requires_grad_() for name, t in leaves.items()}
+    extra = {name: leaves[name] for name in state.extra}
+    state = state.replace(**{name: leaves[name] for name in STATE if name in leaves}, extra=extra)
+    for name in PARAMETERS if step.heat.melts else PARAMETERS[:2]:
+        value = getattr(step.heat, name)
+        if not isinstance(value, PerMaterial):
+            leaves[name] = torch.as_tensor(value).to(state.x).detach().clone().requires_grad_()
+            setattr(step.heat, name, leaves[name])
+    return state, leaves
+
+
+def loss_of(end, of=STATE):
+    """A sum of fields with random weights; the sine keeps large ones from hiding others."""
+    g, total = torch.Generator().manual_seed(1), 0.0
+    fields = [t for name in of if name not in ("mass", "volume") and (t := getattr(end, name)) is not None]
+    for t in (*fields, *end.extra.values()):
+        weight = torch.rand(t.shape, generator=g, dtype=F64).to(t)
+        total = total + (weight * t.sin()).sum()
+    return total
+
+
+def gradients(run, step, state, n, dt, of=STATE, **options):
+    """Gradients of a loss of some fields by all leaves, zero where a leaf takes no part."""
+    state, leaves = with_leaves(step, state)
+    if isinstance(dt, torch.Tensor):
+        dt = leaves["dt"] = dt.detach().clone().requires_grad_(not step.flip)
+    end = run(step, state, n, dt, **options)
+    leaves = {name: leaf for name, leaf in leaves.items() if leaf.requires_grad}
+    grads = torch.autograd.grad(loss_of(end, of), list(leaves.values()), allow_unused=True, materialize_grads=True)
+    return dict(zip(leaves, grads, strict=True))
+
+
+def compare(step, state, n=6, dt=DT, tolerance=1e-10, of=STATE, **options):
+    """Gradients of the op are those of single steps, relative to the largest of each; returns the former. On CUDA sums
+    of nodes have another order in each run."""
+    device = state.x.device
+    step, dt = step.to(device), dt.to(device) if isinstance(dt, torch.Tensor) else dt
+    tolerance *= 10 if state.x.is_cuda else 1
+    step.heat.tolerance, state = 1e-12 if state.x.dtype == F64 else 1e-6, melting(state)
+    assert plan_rollout(step, with_leaves(step, state)[0], n, dt).executor == "fused"
+    found = gradients(mpm.rollout, step, state, n, dt, of, **options)
+    expected = gradients(composed, step, state, n, dt, of)
+    assert found.keys() == expected.keys()
+    for name, value in expected.items():
+        scale = float(value.abs().max())
+        if name in PARAMETERS:  # A sum of terms that nearly cancel.
+            scale = max(scale, float(expected["temperature"].abs().sum()) / 1e3)
+        error = float((found[name] - value).abs().max())
+        assert error <= tolerance * scale, f"{name}: {error / scale}"
+    return found
+
+
+@pytest.mark.parametrize("melts", [False, True])
+@pytest.mark.parametrize("transfer", TRANSFERS)
+def test_transfers(dim, transfer, melts, device):
+    found = compare(*scene(dim, transfer=transfer, melts=melts, device=device))
+    wanted = ["x", "mass", "volume", "temperature", "conductivity", "specific_heat"]
+    wanted += ["temperature_gradient"] if transfer in ("hybrid", "apic") else []
+    wanted += ["liquid", "melting_point", "latent_heat"] if melts else []
+    assert all(float(found[name].abs().max()) > 0 for name in wanted)
+
+
+@pytest.mark.parametrize("law", [*LAWS, "mixture"])
+def test_laws(dim, law, device):
+    compare(*scene(dim, law=law, device=device, melts=True))
+
+
+@pytest.mark.parametrize("seed", range(16))
+def test_random_combinations(seed, device):
+    """Laws x transfers x kernels x batches x parameters x time steps x checkpoints, in both dtypes."""
+    r = random.Random(seed)
+    scenes, dtype = r.choice((1, 3)), r.choice((torch.float32, F64))
+    step, state = scene(
+        r.choice((2, 3)), dtype, scenes, r.choice((*LAWS, "mixture")), melts=r.random() < 0.5,
+        per_particle=r.random() < 0.5, kernel=r.choice(("quadratic", "cubic")), transfer=r.choice(TRANSFERS),
+        flip=r.choice((0.0, 0.4)), compensated=r.choice((True, False)), device=device,
+        deterministic=r.choice((True, False)),
+    )  # fmt: skip
+    dt = torch.linspace(1, 2, scenes, dtype=dtype) * DT if r.random() < 0.5 else DT
+    checkpoint = r.choice((None, 2, mpm.Checkpoints(states=2), mpm.Checkpoints(memory=1e9)))
+    compare(step, state, r.choice((2, 5)), dt, 1e-9 if dtype == F64 else 2e-3, checkpoint=checkpoint)
+
+
+@pytest.mark.parametrize("transfer", ["hybrid", "apic", "flip", "pic"])
+def test_single_precision(transfer, device):
+    compare(*scene(2, torch.float32, transfer=transfer, melts=True, device=device), n=3, tolerance=1e-5)
+
+
+def test_stiff_conduction(device):
+    """Diffusion numbers far above one, at which the solves take many iterations."""
+    step, state = scene(2, device=device)
+    step.heat.conductivity = 2e7
+    compare(step, state, 3, tolerance=1e-8)
+
+
+def test_parameters_of_materials(device):
+    """Parts of a parameter, by the autograd of torch before the op."""
+    step, state = scene(2, law="mixture", device=device)
+    parts = [torch.tensor(500.0 * (1 + k), dtype=F64, device=device, requires_grad=True) for k in range(len(LAWS))]
+    step.heat.conductivity = PerMaterial(parts)
+    grads = []
+    for run in (mpm.rollout, composed):
+        end = run(step, state, 4, DT)
+        grads.append(torch.stack(torch.autograd.grad(loss_of(end), parts)))
+    assert plan_rollout(step, state, 4, DT).executor == "fused" and bool((grads[0] != 0).all())
+    torch.testing.assert_close(*grads, rtol=1e-9, atol=0)
+
+
+@pytest.mark.parametrize("transfer", TRANSFERS)
+def test_absent_particles_and_those_outside(dim, transfer, device):
+    """The gradient of what they keep is one."""
+    step, state = scene(dim, transfer=transfer, melts=True, scenes=2, device=device)
+    step.walls = None
+    absent = torch.arange(len(state), device=device) % 3 == 0
+    outside = torch.tensor([500.0, *[0.0] * (dim - 1)], dtype=F64, device=device)
+    state = state.replace(
+        scene=state.scene.where(~absent, -1), v=torch.where(state.scene[:, None] == 1, outside, state.v)
+    )
+    compare(step, state, 12)
+    start = state.replace(temperature=state.temperature.clone().requires_grad_())
+    end = mpm.rollout(step, start, 12, DT).temperature
+    (grad,) = torch.autograd.grad(end[absent].sum(), start.temperature)
+    assert torch.equal(grad, absent.to(grad))
+
+
+def test_paused_scenes(device):
+    """A scene whose time step is zero passes its gradients on."""
+    step, state = scene(2, scenes=3, melts=True, device=device)
+    compare(step, state, 3, torch.tensor([1.0, 0.0, 2.0], dtype=F64) * DT)
+
+
+@pytest.mark.parametrize("melts", [False, True])
+@pytest.mark.parametrize("transfer", TRANSFERS)
+def test_gradcheck(transfer, melts, device):
+    """Two steps of a few particles, against differences."""
+    step, state = scene(2, transfer=transfer, melts=melts, device=device)
+    step.heat.tolerance, state = 1e-13, melting(state).select(torch.arange(6, device=device))
+    names = ["x", "mass", "volume", "temperature", *state.extra]
+    parameters = PARAMETERS if melts else PARAMETERS[:2]
+
+    def run(*tensors):
+        given = dict(zip([*names, *parameters], tensors, strict=True))
+        for name in parameters:
+            setattr(step.heat, name, 1000 * given[name])
+        extra = {name: given[name] for name in state.extra}
+        start = state.replace(**{name: given[name] for name in names[:4]}, extra=extra)
+        end = mpm.rollout(step, start, 2, 20 * DT)
+        return end.temperature, end.x, *end.extra.values()
+
+    numbers = (2.0, 0.1, 0.003, 0.5)[: len(parameters)]
+    scaled = [torch.tensor(v, dtype=F64, device=device) for v in numbers]
+    leaves = [getattr(state, name) for name in names[:4]] + [*state.extra.values(), *scaled]
+    leaves = [t.detach().clone().requires_grad_() for t in leaves]
+    assert torch.autograd.gradcheck(run, leaves, eps=1e-6, atol=1e-6, rtol=1e-5, nondet_tol=1e-9)
+
+
+@pytest.mark.parametrize("transfer", TRANSFERS)
+def test_differences_over_200_steps_with_melting(transfer, device):
+    """The derivative along a direction of all inputs is that of differences."""
+    step, state = scene(2, transfer=transfer, melts=True, law="fluid", device=device)
+    step.heat.tolerance = 1e-13
+    state = melting(state)
+
+    def end(name, shift):
+        given = copy.deepcopy(step)
+        start, leaves = with_leaves(given, state)
+        leaf = leaves[name]
+        move = float(leaf.detach().abs().max()) * torch.rand(
+            leaf.shape, generator=torch.Generator().manual_seed(4), dtype=F64
+        )
+        with torch.no_grad():
+            leaf += shift * move.to(leaf)
+        after = mpm.rollout(given, start, 200, DT)
+        return loss_of(after), leaf, move.to(leaf), after
+
+    for name in ("temperature", "liquid", "mass", "volume", *PARAMETERS):
+        loss, leaf, move, after = end(name, 0.0)
+        assert float((after.extra["liquid"] - state.extra["liquid"]).detach().abs().max()) > 0.1
+        found = float((torch.autograd.grad(loss, leaf)[0] * move).sum())
+        h = 1e-6
+        with torch.no_grad():
+            expected = float(end(name, h)[0] - end(name, -h)[0]) / (2 * h)
+        assert abs(found - expected) <= 1e-6 * max(abs(found), 0.01), f"{name}: {found} and {expected}"
+
+
+@pytest.mark.parametrize(*in_pairs(with_held=[False, True], name=[*terms(), "all"], dim=[2, 3], melts=[False, True]))
+def test_free_surface_and_sources(dim, name, with_held, melts, device):
+    """Terms of boundaries, alone, together and beside obstacles that hold the nodes in them."""
+    step, state = scene(dim, melts=melts, device=device)
+    step.heat.reference = 290.0
+    chosen = [t for own in terms().values() for t in own] if name == "all" else terms()[name]
+    step.heat.boundaries = chosen
+    if with_held:
+        region, plate = bodies(dim)["sphere"], bodies(dim)["plane"]
+        step = held(step, (heat_boundaries.Fixed, region, 40.0), (heat_boundaries.Fixed, plate, -5.0))
+        step.heat.boundaries = [*chosen, *step.heat.boundaries.entries]
+    compare(step, state, 4)
+
+
+@pytest.mark.parametrize(*in_pairs(shape=bodies(2), dim=[2, 3], melts=[False, True], others=[False, True]))
+def test_held_surfaces(dim, shape, melts, others, device):
+    """Of obstacles of all shapes, alone, and beside terms of the free surface and nodes that are held."""
+    step, state = scene(dim, melts=melts, device=device)
+    chosen = [t for own in terms().values() for t in own] if others else []
+    held_nodes = [(heat_boundaries.Fixed, mpm.Plane((0.0, 0.3, 0.0)[:dim], (0.0, 1.0, 0.0)[:dim]), -5.0)]
+    step = held(step, (heat_boundaries.FixedSurface, bodies(dim)[shape], 40.0), *(held_nodes if others else []))
+    step.heat.boundaries = [*chosen, *step.heat.boundaries.entries]
+    compare(step, state, 4)
+
+
+@pytest.mark.parametrize("per_particle", [False, True])
+def test_boundaries_of_scenes(per_particle, device):
+    """Numbers of scenes, with time steps of their own."""
+    step, state = scene(2, scenes=3, device=device)
+    step.heat.reference = 290.0
+    chosen = [term for own in terms(3, len(state) if per_particle else 0).values() for term in own]
+    temperatures = torch.tensor([10.0, 20.0, 40.0], dtype=F64, device=device)
+    region = bodies(2)["sphere"] if per_particle else mpm.Sphere((0.4, 0.3), 0.1, scene=1)
+    step = held(
+        step,
+        (heat_boundaries.FixedSurface, region, temperatures.flip(0)),
+        (heat_boundaries.Fixed, bodies(2)["plane"], temperatures),
+    )
+    step.heat.boundaries = [*chosen, *step.heat.boundaries.entries]
+    compare(step, state, 4, torch.tensor([1.0, 2.0, 0.5], dtype=F64) * DT)
+
+
+NUMBERS = {"flux": 4e6, "coefficient": 3e4, "ambient": 40.0, "emissivity": 0.9, "power": 2e8, "temperature": 20.0}
+
+
+@pytest.mark.parametrize("size", ["number", "one", "scenes"])
+@pytest.mark.parametrize("scenes", [1, 3])
+def test_numbers_of_boundaries(scenes, size, device):
+    """By fluxes, coefficients, ambient and held temperatures, emissivities and powers; the regions overlap."""
+    count = {"number": None, "one": 1, "scenes": scenes}[size]
+    grads = []
+    for run in (mpm.rollout, composed):
+        step, state = scene(2, scenes=scenes, melts=True, device=device)
+        step.heat.reference, step.heat.tolerance = 290.0, 1e-12
+        leaves = []
+
+        def leaf(name, factor=1.0, leaves=leaves):
+            value = torch.tensor(factor * NUMBERS[name], dtype=F64, device=device)
+            leaves.append((value if count is None else value.expand(count).clone()).requires_grad_())
+            return leaves[-1]
+
+        surface, regions = heat_boundaries.FreeSurface(), bodies(2)
+        step = held(
+            step,
+            (heat_boundaries.Fixed, regions["plane"], leaf("temperature")),
+            (heat_boundaries.Fixed, regions["box"], leaf("temperature", 2.0)),
+            (heat_boundaries.FixedSurface, regions["sphere"], leaf("temperature", 3.0)),
+        )
+        chosen = [
+            heat_boundaries.Flux(surface, leaf("flux")),
+            heat_boundaries.Convection(surface, leaf("coefficient"), leaf("ambient")),
+            heat_boundaries.Radiation(surface, leaf("emissivity"), leaf("ambient", 50.0)),
+            heat_boundaries.Source(leaf("power")),
+        ]
+        step.heat.boundaries = [*chosen, *step.heat.boundaries.entries]
+        end = run(step, melting(state), 3, torch.linspace(1, 2, scenes, dtype=F64, device=device) * DT)
+        grads.append(torch.autograd.grad(loss_of(end, ["temperature"]), leaves))
+    assert plan_rollout(step, state, 3, DT).executor == "fused"
+    for found, expected in zip(*grads, strict=True):
+        assert float(expected.abs().max()) > 0
+        torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-10 * float(expected.abs().max()))
+
+
+def test_powers_of_particles(device):
+    step, state = scene(2, device=device)
+    grads = []
+    for run in (mpm.rollout, composed):
+        power = torch.full((len(state),), 2e8, dtype=F64, device=device, requires_grad=True)
+        step.heat.boundaries = [heat_boundaries.Source(power)]
+        grads.append(torch.autograd.grad(loss_of(run(step, state, 3, DT), ["temperature"]), power)[0])
+    torch.testing.assert_close(*grads, rtol=1e-9, atol=0)
+
+
+@pytest.mark.parametrize(
+    *in_pairs(name=["von_mises", "sand", "viscoelastic", "mixture"], dim=[2, 3], with_source=[False, True])
+)
+def test_plastic_heating(dim, name, with_source, device):
+    """The adjoint of the energy that laws dissipate, by all inputs of the laws."""
+    step, state = scene(dim, law=name, melts=with_source, device=device)
+    step.heat.plastic_heating, step.heat.specific_heat = 0.9, 1.0
+    state = state.replace(v=20 * state.v)
+    if with_source:
+        step.heat.boundaries = terms()["source"]
+    dt, of = DT if with_source else torch.tensor([DT], dtype=F64), ["temperature"]
+    found = compare(step, state, 4, dt, of=of)
+    step.heat.plastic_heating = 0.0
+    without = gradients(mpm.rollout, step, melting(state), 4, DT, of)
+    assert float((found["v"] - without["v"]).abs().max()) > 1e-6 * float(found["v"].abs().max())
+
+
+TABLES = ("softening", "thinning", "two tables")
+
+
+@pytest.mark.parametrize(*in_pairs(name=[*TABLES, "mixture"], dim=[2, 3], share=[0.0, 0.9], scenes=[1, 2]))
+def test_tables_of_laws(dim, name, share, scenes, device):
+    """Laws whose parameters are tables of the temperature, through which it moves the particles."""
+    names = [*TABLES, "neo_hookean"] if name == "mixture" else [name]
+    step, state = thermal(names, dim, scenes=scenes, device=device)
+    step.heat.plastic_heating = share
+    state = step.prepare(state.replace(v=40 * (state.x - 0.45).flip(1)))  # shear
+    found = compare(step, state, 5, torch.linspace(1, 2, scenes, dtype=F64) * DT, 1e-9, of=["v"])
+    assert float(found["temperature"].abs().max()) > 0
+
+
+def test_reasons_for_single_steps(device):
+    """What the op has no adjoint of."""
+    step, state = scene(2, device=device)
+    state = state.replace(temperature=state.temperature.clone().requires_grad_())
+    region = bodies(2)["plane"]
+    step = held(step, (heat_boundaries.FixedSurface, region, 1.0))
+    assert plan_rollout(step, state, 3, DT).executor == "fused"
+    step.boundaries = [
+        *step.boundaries.entries,
+        mpm.Sphere(torch.tensor([0.1, 0.1], device=device, requires_grad=True), 0.05),
+    ]
+    reason = "a surface is held at a temperature, and a gradient is wanted by an obstacle"
+    assert plan_rollout(step, state, 3, DT).reasons["fused"] == reason
+    step.boundaries = step.boundaries.entries[:-1]
+    step.law = THERMAL["expansion"]()
+    reason = "a law expands or melts, and a gradient is wanted"
+    assert plan_rollout(step, state, 3, DT).reasons["fused"] == reason
+    step.law = mpm.NeoHookean(E=mpm.Table([0.0, 9.0], torch.tensor([2e5, 1e5], requires_grad=True)), nu=0.3)
+    reason = "a law reads the temperature and has parameters with gradients, and a gradient is wanted"
+    assert plan_rollout(step, state, 3, DT).reasons["fused"] == reason
+    step = held(step, (heat_boundaries.Fixed, region, lambda t: t))
+    assert plan_rollout(step, state, 3, DT).reasons["fused"] == "temperature of Fixed is a function"
+
+
+def test_adjoint_solves_that_miss_their_tolerance_are_reported(device):
+    step, state = scene(2, device=device)
+    step.heat.conductivity, step.heat.tolerance, step.heat.max_iterations = 2e7, 0.5, 3
+    state = state.replace(temperature=state.temperature.clone().requires_grad_())
+    end = mpm.rollout(step, state, 2, DT)
+    step.check(end)
+    loss_of(end).backward()
+    with pytest.raises(mpm.SimulationError, match="2 heat solves"):
+        step.check(end)
+
+
+def test_the_memory_is_known_beforehand():
+    step, state = scene(3, melts=True)
+    start, _ = with_leaves(step, step.prepare(state))
+    arguments = mpm.substeps_arguments(step, start, 5, DT, records=True)
+    record = torch.ops.torch_mpm.substeps(**arguments)[-1]
+    assert record is not None and record.numel() <= 5 * bytes_of_a_substep(state) + 4096
+
+
+def test_raw_ops(device):
+    step, state = scene(2, melts=True, scenes=2, device=device)
+    step.heat.boundaries = terms()["convection"]
+    start, _ = with_leaves(step, melting(state))
+    arguments = tuple(mpm.substeps_arguments(step, start, 2, DT).values())
+    checks = ("test_schema", "test_autograd_registration", "test_faketensor")
+    torch.library.opcheck(torch.ops.torch_mpm.substeps.default, arguments, test_utils=checks)
+    results = torch.ops.torch_mpm.substeps(*arguments)
+    grads = [None if t is None else torch.randn_like(t) for t in (*results[:6], results[7], results[10])]
+    plain = [t.detach() if isinstance(t, torch.Tensor) else t for t in arguments]
+    plain = [
+        [t.detach() for t in v] if isinstance(v, list) and v and isinstance(v[0], torch.Tensor) else v for v in plain
+    ]
+    adjoint = (grads, 255 - 16, None, *plain)
+    torch.library.opcheck(torch.ops.torch_mpm.substeps_backward.default, adjoint, test_utils=checks)
+    with pytest.raises(RuntimeError, match="grad_heat must have shape"):
+        torch.ops.torch_mpm.substeps_backward([*grads[:7], grads[7][:, 1:]], *adjoint[1:])
