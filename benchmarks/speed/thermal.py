@@ -7,7 +7,8 @@
 The cube of `benchmarks/speed/work.py`, 3-D, float32, one call of `torch_mpm.rollout`; each row beside another of the
 same run. Heat has a diffusion number of `work.DIFFUSION`. `until a time` is `torch_mpm.rollout_to` beside the same
 substeps of fixed length. Warp takes substeps with heat of the same cube (`heat_peer_warp.py`), where it is installed
-(`pip install torch-mpm[bench]`). The sizes of the libraries are those of their files.
+(`pip install torch-mpm[bench]`). The sizes of the libraries are those of their files. On CUDA each kernel of a substep
+with heat stands beside the limits of the memory and of the arithmetic (`heat_kernels.py`).
 """
 
 from __future__ import annotations
@@ -24,12 +25,15 @@ import torch_mpm as mpm
 from torch_mpm import _library
 
 from .. import common, regressions
-from . import peers, rollouts, work
-from .step import STEPS, Setup, difference, run_peer, setup
+from . import heat_kernels, peers, rollouts, work
+from .step import LARGE, STEPS, Setup, difference, run_peer, setup
+from .timing import Clock, copy_ms
 
 SIDES = {"cpu": (22, 64), "cuda": (22, 46, 100, 200)}
 TIMED_SIDES = {"cpu": (22, 40), "cuda": (40, 80, 200)}
 """Of `until a time`."""
+KERNEL_SIDES = {"cpu": (), "cuda": (100, 200)}
+"""Of the kernels of a substep with heat."""
 BATCHES = {"cpu": ((64, 512),), "cuda": ((256, 2197), (1024, 2197))}
 DIFFUSION = 1e-4
 """κ dt / (ρ c dx²) of heat."""
@@ -177,7 +181,18 @@ def measure(device: str, quick: bool = False) -> dict[str, Any]:
     for side in (6,) if quick else TIMED_SIDES[device]:
         rows.append(until_a_time(setup(work.make(side), device), device, samples))
     rows += [until_a_time(rollouts.batched(*batch, device), device, samples) for batch in batches]
-    return {"environment": common.environment(device), "libraries": library_sizes(), "rows": rows}
+    result = {"environment": common.environment(device), "libraries": library_sizes(), "rows": rows}
+    sides = KERNEL_SIDES[device][:1] if quick else KERNEL_SIDES[device]
+    return result | (kernels(sides, samples) if sides else {})
+
+
+def kernels(sides: Iterable[int], samples: int) -> dict[str, Any]:
+    """Kernels of substeps with heat on CUDA, in the form of the parts of `step.py`, and the copy bandwidth."""
+    clock = Clock("cuda", samples)
+    with clock:
+        rate = 2 * LARGE / copy_ms(clock, 2 * LARGE) * 1e-6
+    sizes = [heat_kernels.measure(heated(setup(work.make(side), "cuda")), clock) for side in sides]
+    return {"copy_GB_s": rate, "sizes": sizes}
 
 
 def us_of(name: str, rows: Iterable[dict[str, Any]]) -> float:
@@ -209,13 +224,16 @@ def notes(result: dict[str, Any]) -> Iterator[str]:
 
 def text(result: dict[str, Any]) -> str:
     title, place = "# Steps with heat, laws of temperature and hardening", common.describe(result["environment"])
-    return "\n".join([title, "", place, "", table(result), "", *notes(result), ""])
+    parts = [title, place, table(result), "\n".join(notes(result)), *map(heat_kernels.text, result.get("sizes", ()))]
+    return "\n\n".join([*filter(None, parts), ""])
 
 
 def timed(result: dict[str, Any]) -> Iterator[tuple[str, float]]:
-    """Microseconds per substep, for `regressions`."""
+    """Microseconds per substep, and of its kernels, for `regressions`."""
     for r in result["rows"]:
         yield f"{r['name']}, {r['particles']} particles", r["us"]
+    for entry in result.get("sizes", ()):
+        yield from ((f"{p['name']}, {entry['particles']} particles", p["ms"] * 1e3) for p in entry["parts"])
 
 
 def main() -> None:
