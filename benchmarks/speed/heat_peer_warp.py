@@ -3,8 +3,9 @@
 P2G of temperature and its gradient, the implicit solve and G2P on the same dense grid, with atomic adds. The solve of
 (M/dt + H) d = −H θ is by conjugate gradients without a matrix, preconditioned by M/dt. It has a fixed number of
 iterations, so that the host reads nothing. In units of M/dt the spectrum lies between 1 and 1 + 4 r (csrc/heat/cell.h),
-r being the diffusion number, and k iterations leave at most 2 r^k of the error. At that of `work.py` ITERATIONS is the
-least number that meets the tolerance of `torch_mpm.Heat`. The figures have the residual after the last step.
+r being the diffusion number, and k iterations leave at most 2 r^k of the error (Saad 2003, section 6.11.3). At that of
+`work.py` ITERATIONS is the least number that meets the tolerance of `torch_mpm.Heat`. The figures have the residual
+after the last step.
 """
 
 from __future__ import annotations

@@ -6,9 +6,9 @@
 
 The cube of `benchmarks/speed/work.py`, 3-D, float32, one call of `torch_mpm.rollout`; each row beside another of the
 same run. Heat has a diffusion number of `work.DIFFUSION`. `until a time` is `torch_mpm.rollout_to` beside the same
-substeps of fixed length. Warp takes substeps with heat of the same cube (`heat_peer_warp.py`), where it is installed
-(`pip install torch-mpm[bench]`). The sizes of the libraries are those of their files. On CUDA each kernel of a substep
-with heat stands beside the limits of the memory and of the arithmetic (`heat_kernels.py`).
+substeps of fixed length. Warp takes substeps with heat of the same cube (`heat_peer_warp.py`), on CPUs by one thread,
+where it is installed (`pip install torch-mpm[bench]`). The sizes of the libraries are those of their files. On CUDA
+each kernel of a substep with heat stands beside the limits of the memory and of the arithmetic (`heat_kernels.py`).
 """
 
 from __future__ import annotations
