@@ -18,7 +18,7 @@ from typing import Any
 from . import common, envs_ppo
 from .accuracy.limits import tables as limit_tables
 from .accuracy.runout import PUBLISHED, published, slopes
-from .speed import doors, network_steps, roofline, scaling, thermal
+from .speed import doors, heat_kernels, network_steps, roofline, scaling, thermal
 from .speed import training as speed_of_training
 from .speed.rollouts import row_beside, row_of_peer, row_of_steps
 from .speed.training_scripts import PROJECTS
@@ -544,6 +544,10 @@ def thermal_speed(results: list[dict[str, Any]]) -> str:
     parts = [intro]
     for result in results:
         parts += [common.describe(result["environment"]) + ":", thermal.table(result)]
+        parts += filter(None, ["\n".join(thermal.notes(result))])
+        parts += [heat_kernels.text(entry) for entry in result.get("sizes", ())]
+    if any("sizes" in result for result in results):
+        parts += ["![bytes per second of each kernel, and of a copy](benchmarks/results/heat_roofline.png)"]
     return "\n\n".join(parts)
 
 
@@ -665,6 +669,7 @@ def draw(directory: Path) -> None:
     """The figures of several devices."""
     for name, pattern, plot in (
         ("roofline", "speed_*.json", roofline.plot),
+        ("heat_roofline", "thermal_*.json", roofline.plot),
         ("rollouts", "rollouts_*.json", scaling.plot),
     ):
         if results := common.read(directory, pattern):

@@ -1,4 +1,4 @@
-"""Figure of the bytes per second of each part of a step, compared with the bandwidth of the memory."""
+"""Figure of the bytes per second of each part or kernel of a step, compared with the bandwidth of the memory."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ from typing import Any
 
 
 def plot(results: Sequence[dict[str, Any]], path: Path) -> None:
-    """A panel for each device, with its largest size."""
+    """A panel for each device, with its largest size; none without results that have sizes."""
+    results = [result for result in results if result.get("sizes")]
+    if not results:
+        return
     import matplotlib
 
     matplotlib.use("Agg")

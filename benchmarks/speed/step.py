@@ -260,9 +260,10 @@ def run_peer(
 
 
 def difference(state: mpm.State, saved: Path) -> dict[str, float]:
-    """Largest difference of positions [m] and velocities [m/s] from those of a peer after the same number of steps."""
+    """Largest difference of each field that a peer has, in its unit, from that of the peer after the same steps."""
     with np.load(saved) as other:
-        return {k: float(np.abs(getattr(state, k).detach().cpu().numpy() - other[k]).max()) for k in ("x", "v")}
+        ours = {k: state.extra[k] if k in state.extra else getattr(state, k) for k in other.files}
+        return {k: float(np.abs(field.detach().cpu().numpy() - other[k]).max()) for k, field in ours.items()}
 
 
 # ---- the program

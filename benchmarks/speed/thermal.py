@@ -5,13 +5,16 @@
     python -m benchmarks.speed.thermal --out DIRECTORY
 
 The cube of `benchmarks/speed/work.py`, 3-D, float32, one call of `torch_mpm.rollout`; each row beside another of the
-same run. Heat has a diffusion number of DIFFUSION. `until a time` is `torch_mpm.rollout_to` beside the same substeps of
-fixed length.
+same run. Heat has a diffusion number of `work.DIFFUSION`. `until a time` is `torch_mpm.rollout_to` beside the same
+substeps of fixed length. Warp takes substeps with heat of the same cube (`heat_peer_warp.py`), on CPUs by one thread,
+where it is installed (`pip install torch-mpm[bench]`). The sizes of the libraries are those of their files. On CUDA
+each kernel of a substep with heat stands beside the limits of the memory and of the arithmetic (`heat_kernels.py`).
 """
 
 from __future__ import annotations
 
 import argparse
+import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -19,36 +22,46 @@ from typing import Any
 import torch
 
 import torch_mpm as mpm
+from torch_mpm import _library
 
 from .. import common, regressions
-from . import rollouts, work
-from .step import Setup, setup
+from . import heat_kernels, peers, rollouts, work
+from .step import LARGE, STEPS, Setup, difference, run_peer, setup
+from .timing import Clock, copy_ms
 
 SIDES = {"cpu": (22, 64), "cuda": (22, 46, 100, 200)}
 TIMED_SIDES = {"cpu": (22, 40), "cuda": (40, 80, 200)}
 """Of `until a time`."""
+KERNEL_SIDES = {"cpu": (), "cuda": (100, 200)}
+"""Of the kernels of a substep with heat."""
 BATCHES = {"cpu": ((64, 512),), "cuda": ((256, 2197), (1024, 2197))}
 DIFFUSION = 1e-4
 """κ dt / (ρ c dx²) of heat."""
 MOST_SUBSTEPS = 4096
 """Of a call `until a time`."""
-SPECIFIC_HEAT, EXPANSION, LATENT_HEAT = 1000.0, 1e-4, 2e4
-"""[J/(kg K)], [1/K], [J/kg]."""
+EXPANSION, LATENT_HEAT = 1e-4, 2e4
+"""[1/K], [J/kg]."""
 SOFTENING = ((0.0, 5.0, 10.0), (1.2e5, 1e5, 4e4))
 """Temperatures [K] and E [Pa] of a law that softens."""
 NU = 0.25
 
 
-def heated(s: Setup, law: mpm.Material | None = None, melts: bool = False, **options: Any) -> Setup:
-    """A cube with heat, temperatures of 0 to 10 K, and optionally another law."""
+def heated(
+    s: Setup,
+    law: mpm.Material | None = None,
+    melts: bool = False,
+    diffusion: float = work.DIFFUSION,
+    **options: Any,
+) -> Setup:
+    """A cube with the heat of `work.py`, and optionally another law."""
     grid = s.step.grid
-    conductivity = DIFFUSION * work.DENSITY * SPECIFIC_HEAT * grid.dx**2 / work.DT
     melting = {"melting_point": 5.0, "latent_heat": LATENT_HEAT} if melts else {}
-    heat = mpm.Heat(grid, conductivity, SPECIFIC_HEAT, **melting, **options)
+    heat = mpm.Heat(grid, work.conductivity(grid.dx, diffusion), work.SPECIFIC_HEAT, **melting, **options)
     step = rollouts.changed(s, heat=heat, law=law or s.step.law)
-    x = s.state.x
-    theta = 5 + 5 * torch.sin(40 * x[:, 0]) * torch.cos(30 * x[:, 1])
-    return Setup(step.prepare(s.state.replace(temperature=theta, F=None, J=None)), step)
+    x = s.state.x.cpu().numpy()
+    theta, gradient = (torch.from_numpy(f(x)).to(s.state.x) for f in (work.temperature, work.temperature_gradient))
+    extra = {**s.state.extra, "temperature_gradient": gradient}
+    return Setup(step.prepare(s.state.replace(temperature=theta, extra=extra, F=None, J=None)), step)
 
 
 def softening() -> mpm.Material:
@@ -101,6 +114,37 @@ def named(name: str, scenes: int) -> str:
     return name if scenes == 1 else f"{name}, {scenes} scenes"
 
 
+def of_peer(device: str, side: int, scenes: int, us: float) -> Iterator[dict[str, Any]]:
+    """Warp's substep with heat of one cube or of cubes side by side, beside ours of `us`, with the differences from one
+    of ours after STEPS of them.
+    """
+    if not peers.is_installed("warp"):
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        saved = Path(folder) / "moved.npz"
+        options = ["--scenes", str(scenes)] if scenes > 1 else ["--save", str(saved)]
+        (peer,) = run_peer("warp", device, [side], 7, "--heat", *options)
+        row = {key: peer[key] for key in ("particles", "iterations", "residual")}
+        if scenes == 1:
+            row["difference"] = difference(after_steps(side, device), saved)
+    spent = 1e3 * peer["fastest_ms"]
+    row |= {"name": named(f"peer: Warp {peer['version']}", scenes), "steps": STEPS, "us": spent}
+    yield {**row, "rate": row["particles"] / spent * 1e6, "beside": "heat", "times": spent / us}
+
+
+def after_steps(side: int, device: str) -> mpm.State:
+    """A cube with heat after STEPS substeps."""
+    s = heated(setup(work.make(side), device))
+    with torch.no_grad():
+        return mpm.rollout(s.step, s.state, STEPS, work.DT)
+
+
+def library_sizes() -> dict[str, int]:
+    """Bytes of the library files of this installation."""
+    files = (_library.CPU_LIBRARY, _library.CUDA_LIBRARY)
+    return {file.name: file.stat().st_size for file in files if file.exists()}
+
+
 def until_a_time(s: Setup, device: str, samples: int) -> dict[str, Any]:
     """Substeps whose length follows the limit, beside substeps of their mean length."""
     state, scenes = s.state.sorted(s.step.grid), s.step.grid.scenes
@@ -127,14 +171,32 @@ def measure(device: str, quick: bool = False) -> dict[str, Any]:
     samples = 1 if quick else 5
     rows: list[dict[str, Any]] = []
     for side in (6,) if quick else SIDES[device]:
-        rows += beside_each_other(setup(work.make(side), device), ROWS, device, samples)
+        cubes = list(beside_each_other(setup(work.make(side), device), ROWS, device, samples))
+        rows += [*cubes, *of_peer(device, side, 1, us_of("heat", cubes))]
     batches = ((4, 64),) if quick else BATCHES[device]
-    for batch in batches:
-        rows += beside_each_other(rollouts.batched(*batch, device), ("neo-Hookean", "heat"), device, samples)
+    for scenes, particles in batches:
+        batch = rollouts.batched(scenes, particles, device)
+        cubes = list(beside_each_other(batch, ("neo-Hookean", "heat"), device, samples))
+        rows += [*cubes, *of_peer(device, rollouts.side_of(particles), scenes, us_of(named("heat", scenes), cubes))]
     for side in (6,) if quick else TIMED_SIDES[device]:
         rows.append(until_a_time(setup(work.make(side), device), device, samples))
     rows += [until_a_time(rollouts.batched(*batch, device), device, samples) for batch in batches]
-    return {"environment": common.environment(device), "rows": rows}
+    result = {"environment": common.environment(device), "libraries": library_sizes(), "rows": rows}
+    sides = KERNEL_SIDES[device][:1] if quick else KERNEL_SIDES[device]
+    return result | (kernels(sides, samples) if sides else {})
+
+
+def kernels(sides: Iterable[int], samples: int) -> dict[str, Any]:
+    """Kernels of substeps with heat on CUDA, in the form of the parts of `step.py`, and the copy bandwidth."""
+    clock = Clock("cuda", samples)
+    with clock:
+        rate = 2 * LARGE / copy_ms(clock, 2 * LARGE) * 1e-6
+    sizes = [heat_kernels.measure(heated(setup(work.make(side), "cuda")), clock) for side in sides]
+    return {"copy_GB_s": rate, "sizes": sizes}
+
+
+def us_of(name: str, rows: Iterable[dict[str, Any]]) -> float:
+    return next(r["us"] for r in rows if r["name"] == name)
 
 
 def table(result: dict[str, Any]) -> str:
@@ -146,15 +208,32 @@ def table(result: dict[str, Any]) -> str:
     return common.table(header, rows)
 
 
+def notes(result: dict[str, Any]) -> Iterator[str]:
+    """Sentences on the peer and on the libraries, where the result has them."""
+    if by_peer := [r for r in result["rows"] if "residual" in r]:
+        iterations, residual = by_peer[0]["iterations"], max(r["residual"] for r in by_peer)
+        found = [r["difference"]["temperature"] for r in by_peer if "difference" in r]
+        yield (
+            f"The peer solves for heat by {iterations} iterations of conjugate gradients; they leave {residual:.1e} of "
+            "the first residual at most."
+        )
+        yield f"Its temperatures, 0 to 10 K, are within {max(found):.1e} K of those of `heat` after {STEPS} substeps."
+    if sizes := result.get("libraries"):
+        yield "Libraries: " + ", ".join(f"{name} {size / 1e6:.1f} MB" for name, size in sizes.items()) + "."
+
+
 def text(result: dict[str, Any]) -> str:
     title, place = "# Steps with heat, laws of temperature and hardening", common.describe(result["environment"])
-    return "\n".join([title, "", place, "", table(result), ""])
+    parts = [title, place, table(result), "\n".join(notes(result)), *map(heat_kernels.text, result.get("sizes", ()))]
+    return "\n\n".join([*filter(None, parts), ""])
 
 
 def timed(result: dict[str, Any]) -> Iterator[tuple[str, float]]:
-    """Microseconds per substep, for `regressions`."""
+    """Microseconds per substep, and of its kernels, for `regressions`."""
     for r in result["rows"]:
         yield f"{r['name']}, {r['particles']} particles", r["us"]
+    for entry in result.get("sizes", ()):
+        yield from ((f"{p['name']}, {entry['particles']} particles", p["ms"] * 1e3) for p in entry["parts"])
 
 
 def main() -> None:

@@ -130,3 +130,15 @@ def read_ms(clock: Clock, size: int) -> float:
     """Minimum time of a sum over `size` bytes [ms]."""
     values = torch.ones(size // 4, device=clock.device)
     return clock.op(values.sum).fastest_ms
+
+
+def float32_rate(clock: Clock, n: int = 8192) -> float:
+    """Largest rate of operations of a product of n × n matrices in float32, without tensor cores [1/s]."""
+    a, b = (torch.rand(n, n, device=clock.device) for _ in range(2))
+    product = torch.empty_like(a)
+    precision = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("highest")
+    try:
+        return 2 * n**3 / clock.op(lambda: torch.mm(a, b, out=product)).fastest_ms * 1e3
+    finally:
+        torch.set_float32_matmul_precision(precision)

@@ -1,12 +1,14 @@
 """Common work of all programs of the comparison: a dense cube of neo-Hookean particles, quadratic kernel, float32.
 
 side³ particles, 8 per cell with jitter, in a domain of the unit cube with n³ cells, sorted by block of 4³ nodes and by
-cell. A smooth velocity field moves them, gravity pulls them, walls are far away. Needs numpy alone.
+cell. A smooth velocity field moves them, gravity pulls them, walls are far away. With heat they also conduct, from
+smooth temperatures. Needs numpy alone.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 
@@ -16,6 +18,20 @@ GRAVITY = 9.8
 DT = 1e-4
 MARGIN = 8
 """Empty cells between the cube and the walls."""
+SPECIFIC_HEAT = 1000.0
+"""[J/(kg K)]"""
+DIFFUSION = 1e-4
+"""κ dt / (ρ C dx²) of cubes with heat."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Program:
+    """One step of a peer; synchronisation; the fields of the particles by the names of `State`; further figures."""
+
+    step: Callable[[], None]
+    synchronize: Callable[[], None]
+    fields: Callable[[], dict[str, np.ndarray]]
+    figures: Callable[[], dict[str, float]] = dict
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,3 +92,20 @@ def make(side: int) -> Work:
     x = x[np.argsort(key, kind="stable")]
     turned = 2 * np.pi * x[:, [1, 2, 0]]
     return Work(n, x, (0.1 * np.sin(turned)).astype(np.float32), (0.5 / n) ** 3)
+
+
+def conductivity(dx: float, diffusion: float = DIFFUSION) -> float:
+    """κ [W/(m K)] with this diffusion number in a step of DT."""
+    return diffusion * DENSITY * SPECIFIC_HEAT * dx**2 / DT
+
+
+def temperature(x: np.ndarray) -> np.ndarray:
+    """Temperatures of 0 to 10 K at the beginning [P]."""
+    return (5 + 5 * np.sin(40 * x[:, 0]) * np.cos(30 * x[:, 1])).astype(np.float32)
+
+
+def temperature_gradient(x: np.ndarray) -> np.ndarray:
+    """Gradient of these temperatures [P, 3] [K/m]."""
+    along_x = 200 * np.cos(40 * x[:, 0]) * np.cos(30 * x[:, 1])
+    along_y = -150 * np.sin(40 * x[:, 0]) * np.sin(30 * x[:, 1])
+    return np.stack([along_x, along_y, np.zeros_like(along_x)], 1).astype(np.float32)
