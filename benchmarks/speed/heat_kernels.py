@@ -31,13 +31,13 @@ D, SUPPORT = 3, 3
 STEPS = 2
 """Steps of a heat solve at `work.DIFFUSION`, each with a product: `simple_steps` of csrc/heat/solve.h."""
 SUBSTEPS = 8
-"""Of a profiled call; more are replayed from CUDA graphs."""
+"""Of a profiled call; more are replayed from CUDA graphs. Its activations are among the other kernels."""
 CALLS = 5
 """Profiled calls; the median is reported."""
 
 SCALARS = (
-    "index", "base_slot", "key", "rank", "mass", "rest_volume", "volume", "theta", "conductance", "blend", "number",
-    "capacity", "mean", "weight", "inverse", "r", "p", "product", "increment",
+    "index", "mass", "rest_volume", "volume", "strain_rate", "theta", "conductance", "blend", "capacity", "mean",
+    "product", "increment",
 )  # fmt: skip
 WORDS = dict.fromkeys(SCALARS, 1) | {
     "x": D, "v": D, "gradient": D, "C": D * D, "F": D * D, "packed": D + 1, "nodes": D + 1, "updated": D + 1, "sums": 4,
@@ -84,7 +84,9 @@ MOMENTUM = D + 1 + D * D + 3 + 2 * D * D
 """m v, and m dx C − dt V D⁻¹ dx⁻¹ τ."""
 MOTION = D * D + 2 * D + MATRIX_PRODUCT + 2 * D * D
 """C from its moments, x + dt v, and F + dt C F."""
-HEAT_WEIGHTS = 4 * D * D + 10 + 3 * (1 + D) + D
+STRAIN_RATE = 4 * D * D + 1
+"""|sym ∇v|."""
+HEAT_WEIGHTS = 9 + 3 * (1 + D) + D
 """Capacity, conductance, diffusion number and blend, and what they add to the nodes."""
 HEAT_UPDATE = 4 * (1 + D) + 2 * D + 2 * (MATRIX_VECTOR + D) + 2 * D
 """The blend of increment and average, and the transport of the gradient."""
@@ -92,14 +94,8 @@ HEAT_UPDATE = 4 * (1 + D) + 2 * D + 2 * (MATRIX_VECTOR + D) + 2 * D
 
 # ---- kernels
 
-SOLVE = (
-    "theta product product",  # H θ
-    "theta weight inverse product capacity mass weight inverse r p product increment",  # start
-    "weight inverse r p p p product product mass weight inverse r p product increment product r increment",  # a step
-    "inverse r increment increment",  # the last one
-    "mass increment increment",  # end
-)
-"""Values of the nodes of active blocks that the phases of a solve of STEPS read and write."""
+PRODUCTS = "theta product product capacity theta product product product"
+"""Values of the nodes of active blocks that the products of the STEPS read and write: H θ, and H d."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -131,30 +127,22 @@ class Kernel:
 
 KERNELS = (
     Kernel(
-        "activation",
-        ("activate_at_once", "classify_kernel", "list_tiles_kernel", "slots_kernel", "offsets_kernel",
-         "place_kernel", "take_back_kernel"),
-        "x key rank key rank index base_slot",
-    ),
-    Kernel("present volumes", ("HeatVolumesArguments",), "rest_volume F volume", operations=DETERMINANT + 1),
-    Kernel("zeros", ("Memset",), pool="nodes sums"),
-    Kernel(
         "law and P2G", ("ReorderingSource",), "index x mass rest_volume v C F", "nodes nodes",
         operations=LAW + MOMENTUM + scattered(1, D),
     ),
-    Kernel("grid update", ("grid_update_kernel",), pool="nodes updated"),
-    Kernel("G2P and F", ("AdvanceGather",), "index x F v C x F", "updated", operations=gathered(D) + MOTION),
+    Kernel("grid update", ("next_grid_kernel",), "", "nodes updated nodes"),
     Kernel(
-        "P2G of heat", ("HeatSource",), "index x mass C theta gradient volume conductance blend number", "sums sums",
+        "G2P and F", ("HeatAdvanceGather",), "index x F rest_volume v C x F strain_rate volume", "updated",
+        operations=gathered(D) + MOTION + STRAIN_RATE + DETERMINANT + 1,
+    ),
+    Kernel(
+        "P2G of heat", ("HeatSource",), "index x mass strain_rate theta gradient volume conductance blend", "sums sums",
         operations=HEAT_WEIGHTS + scattered(2, 2),
     ),
-    Kernel("averages of the nodes", ("HeatMeansArguments",), pool="sums theta capacity mean"),
-    Kernel("largest diffusion number, status", ("HeatLargestArguments", "HeatCountArguments"), "number"),
-    Kernel(
-        "heat solve", ("heat_kernel", "scene_kernel"), "index x conductance packed" + " packed" * STEPS,
-        " ".join(SOLVE), "product inverse weight", STEPS * applied(),
-    ),
-    Kernel("increments of the nodes", ("HeatIncrementsArguments",), pool="increment theta increment"),
+    Kernel("averages of the nodes", ("HeatMeansArguments",), pool="sums theta capacity mean sums product product"),
+    Kernel("packed particles", ("pack_kernel",), "index x conductance packed"),
+    Kernel("products with H", ("product_kernel",), " ".join(["packed"] * STEPS), PRODUCTS, "", STEPS * applied()),
+    Kernel("increments of the nodes", ("HeatFinishArguments",), "", "capacity theta product product theta increment"),
     Kernel(
         "G2P of heat", ("HeatGather",), "index x C blend theta gradient theta gradient", "increment mean",
         operations=gathered(2) + HEAT_UPDATE,

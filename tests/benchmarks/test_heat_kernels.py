@@ -16,27 +16,19 @@ from benchmarks.speed.timing import Clock, float32_rate
 # Names that the compiler gives the kernels of the substep, and some of other kernels.
 EACH = "void mpm::cuda::each_kernel<&(void mpm::baseline::{}<float, 3>(mpm::{}<float, 3> const&, long))>"
 ANONYMOUS = "mpm::cuda::(anonymous namespace)::"
-LARGEST = "largest diffusion number, status"
 NAMES = {
-    f"void {ANONYMOUS}activate_at_once<2, float, 3>(mpm::ActivateArguments<float, 3>, int, long)": "activation",
-    f"void {ANONYMOUS}classify_kernel<2, true, float, 3>(mpm::ActivateArguments<float, 3>)": "activation",
-    f"{ANONYMOUS}list_tiles_kernel({ANONYMOUS}Workspace)": "activation",
-    f"void {ANONYMOUS}slots_kernel<false, true, float, 3>(mpm::ActivateArguments<float, 3>, int)": "activation",
-    f"void {ANONYMOUS}offsets_kernel<true, float, 3>(mpm::ActivateArguments<float, 3>, int)": "activation",
-    f"void {ANONYMOUS}place_kernel<float, 3>(mpm::ActivateArguments<float, 3>)": "activation",
-    f"void {ANONYMOUS}take_back_kernel<float, 3>(mpm::ActivateArguments<float, 3>, int)": "activation",
-    EACH.format("heat_volume", "HeatVolumesArguments"): "present volumes",
-    "Memset (Device)": "zeros",
+    f"void {ANONYMOUS}activate_at_once<2, float, 3>(mpm::ActivateArguments<float, 3>, int, long)": None,
+    EACH.format("heat_volume", "HeatVolumesArguments"): None,
+    "Memset (Device)": None,
     "void mpm::cuda::scatter_kernel<mpm::cuda::ReorderingSource<mpm::baseline::NeoHookean, float, 3> >": "law and P2G",
-    f"void {ANONYMOUS}grid_update_kernel<float, 3>(mpm::GridUpdateArguments<float, 3>)": "grid update",
-    "void mpm::cuda::gather_kernel<true, mpm::cuda::AdvanceGather<2, float, 3, false, false, true> >": "G2P and F",
+    f"void {ANONYMOUS}next_grid_kernel<false, float, 3>(mpm::NextGridArguments<float, 3>)": "grid update",
+    f"void mpm::cuda::gather_kernel<true, {ANONYMOUS}HeatAdvanceGather<2, float, 3> >": "G2P and F",
     f"void mpm::cuda::scatter_kernel<{ANONYMOUS}HeatSource<2, float, 3> >": "P2G of heat",
-    EACH.format("heat_mean", "HeatMeansArguments"): "averages of the nodes",
-    f"void {ANONYMOUS}largest_kernel<float, 3>(mpm::HeatLargestArguments<float, 3>)": LARGEST,
-    EACH.format("count_solve", "HeatCountArguments"): LARGEST,
-    "void mpm::cuda::heat_kernel<2, float, 3>(mpm::cuda::HeatKernel<2, float, 3>)": "heat solve",
-    "void mpm::cuda::scene_kernel<2, float, 3>(mpm::cuda::SceneKernel<2, float, 3>)": "heat solve",
-    EACH.format("heat_increment", "HeatIncrementsArguments"): "increments of the nodes",
+    EACH.format("mean_and_clear", "HeatMeansArguments"): "averages of the nodes",
+    f"void {ANONYMOUS}pack_kernel<2, float, 3>({ANONYMOUS}SimpleKernel<2, float, 3>)": "packed particles",
+    f"void {ANONYMOUS}product_kernel<2, float, 3>({ANONYMOUS}SimpleKernel<2, float, 3>)": "products with H",
+    "void mpm::cuda::heat_kernel<2, float, 3>(mpm::cuda::HeatKernel<2, float, 3>)": None,
+    EACH.format("finish", "HeatFinishArguments"): "increments of the nodes",
     f"void mpm::cuda::gather_kernel<false, {ANONYMOUS}HeatGather<2, float, 3, true> >": "G2P of heat",
     f"void mpm::cuda::scatter_kernel<{ANONYMOUS}HeatSurfaceSource<2, float, 3> >": None,
     "void at::native::vectorized_elementwise_kernel<4, at::native::FillFunctor<float>>": None,
@@ -81,13 +73,13 @@ def test_times_of_overlapping_kernels_are_a_partition() -> None:
 
 
 def test_times_of_a_call_are_shared_by_its_substeps() -> None:
-    names = [name for name in NAMES if name != "Memset (Device)"]
+    names = [name for name, phase in NAMES.items() if phase != "packed particles"]
     n = heat_kernels.SUBSTEPS
-    with pytest.raises(RuntimeError, match="got none of: zeros"):
+    with pytest.raises(RuntimeError, match="got none of: packed particles"):
         heat_kernels.by_kernel((name, 1.0) for name in names)
-    found = heat_kernels.by_kernel((name, 1.0) for name in NAMES)
-    assert found["activation"] == pytest.approx((7 / n, 7 / n)) and found["zeros"] == pytest.approx((1 / n, 1 / n))
-    assert found["others"] == pytest.approx((3 / n, 3 / n))
+    found = heat_kernels.by_kernel((name, 1.0) for name in [*NAMES, *NAMES])
+    assert found["packed particles"] == pytest.approx((2 / n, 2 / n))
+    assert found["others"] == pytest.approx((2 * 7 / n, 2 * 7 / n))
 
 
 def test_bytes_are_those_of_the_tensors() -> None:
@@ -96,8 +88,9 @@ def test_bytes_are_those_of_the_tensors() -> None:
     state, blocks = s.state, s.grid.activate(s.state.x)
     theta, gradient = state.temperature, state.extra["temperature_gradient"]
     scalar = torch.empty_like(state.mass)
-    results = [scalar] * 3  # conductance, blend and diffusion number
-    fields = [blocks.index, state.x, state.mass, state.C, theta, gradient, scalar, *results]
+    results = [scalar] * 2  # conductance and blend
+    strain_rate = volume = scalar
+    fields = [blocks.index, state.x, state.mass, strain_rate, theta, gradient, volume, *results]
     sums = torch.zeros(blocks.node_count, 4)
     active = int(blocks.active_nodes().sum())
     (kernel,) = (kernel for kernel in KERNELS if kernel.name == "P2G of heat")
@@ -154,7 +147,7 @@ def found_with_kernels(ms: float = 0.1) -> dict:
 def test_kernels_are_reported_with_their_limits() -> None:
     found = found_with_kernels()
     text = thermal.text(found)
-    assert "Together 1200 us, 270 us at the limits." in text and "60 TFLOP/s" in text
+    assert "Together 900 us, 210 us at the limits." in text and "60 TFLOP/s" in text
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line.startswith("| ")]
     limits = {row[0]: row[-1] for row in rows}
     assert limits["law and P2G"] == "arithmetic" and limits["grid update"] == "memory"
