@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -16,6 +17,9 @@ from .exchange import VELOCITY, Part, parts_of, swirl
 
 class Joint:
     """Motion that a body is free to have. This one allows all of it."""
+
+    name: ClassVar = "free"
+    """The joint among `torch_mpm.ops.free_bodies.JOINTS`."""
 
     def directions(self, position: Tensor) -> Tensor | None:
         """Velocities and angular velocities [B, n, f] that the body at a position [B, D] may have; None for all."""
@@ -36,6 +40,8 @@ class Hinge(Joint):
         anchor: a point of the axis [m], D numbers.
         axis: its direction, 3 numbers of any length but zero; None in 2-D.
     """
+
+    name: ClassVar = "hinge"
 
     def __init__(self, anchor: Sequence[float], axis: Sequence[float] | None = None) -> None:
         self.anchor = check_vector("anchor", anchor)
@@ -62,6 +68,8 @@ class Slider(Joint):
         axis: the direction, D numbers of any length but zero.
     """
 
+    name: ClassVar = "slider"
+
     def __init__(self, axis: Sequence[float]) -> None:
         self.axis = _unit("axis", axis)
 
@@ -77,6 +85,8 @@ class Slider(Joint):
 
 class Driven(Joint):
     """No motion but the velocity that the body is given: nothing pushes it."""
+
+    name: ClassVar = "driven"
 
     def directions(self, position: Tensor) -> Tensor | None:
         return position.new_zeros(len(position), VELOCITY[position.shape[1]], 0)

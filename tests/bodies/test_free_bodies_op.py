@@ -1,0 +1,185 @@
+"""The op of free bodies against the same steps from Python, which differentiate the contact of the nodes."""
+
+import math
+
+import pytest
+import torch
+from cases.impulses import F64
+from pairs import in_pairs
+
+import torch_mpm as mpm
+from torch_mpm.bodies import Body, Driven, FreeBodies, Hinge, Part, Slider
+from torch_mpm.ops.free_bodies import JOINTS
+
+OPTIONS = {
+    torch.float32: {"rtol": 2e-4, "atol": 2e-4},
+    F64: {"rtol": 1e-10, "atol": 1e-11},
+}
+AT = (1.02, 1.18, 0.97)
+
+
+def joint_of(name, dim):
+    if name == "hinge":
+        return Hinge((1.3, 1.4, 1.0)[:dim], None if dim == 2 else (0.2, 0.1, 1.0))
+    return {"free": None, "slider": Slider((0.3, -1.0, 0.1)[:dim]), "driven": Driven()}[name]
+
+
+def shape_of(name, dim, **options):
+    if name == "box":
+        return mpm.Box((0.0,) * dim, (0.4, 0.3, 0.35)[:dim], **options)
+    if name == "cup":
+        outline = [(0, -0.2), (0.25, -0.2), (0.25, 0.2), (0.15, 0.2), (0.15, -0.1), (0, -0.1)]
+        return mpm.Revolved((0.0,) * dim, outline, **options)
+    return mpm.Sphere((0.0,) * dim, 0.2, **options)
+
+
+def made(dim, device, dtype, joint="free", shape="sphere", kind="separate", friction=0.4, scenes=1, walls=None):
+    """A block of particles, and on it a body with the joint, of two parts, and a light free ball beside it that may
+    share nodes with it; rows [B, 2, ...]."""
+    grid = mpm.Grid(0.1, (0.0,) * dim, (2.0,) * dim, scenes=scenes)
+    gravity = (0.5, -9.8, 0.3)[:dim]
+    step = mpm.Step(grid, mpm.NeoHookean(E=1e4, nu=0.3), gravity, walls)
+    low = (0.6, 0.6, 0.6) if walls is None else (0.0, 0.6, 0.6)
+    one = mpm.State.at_rest(mpm.seed.box(low[:dim], (1.4, 1.0, 1.4)[:dim], grid, per_cell=2**dim), 1000.0, None, dtype)
+    state = mpm.State.concatenate([one] * scenes, scene=True) if scenes > 1 else one
+    turn = 0.3 if dim == 2 else (0.1, -0.2, 0.3)
+    parts = [
+        Part(shape_of(shape, dim, kind=kind, friction=friction), (0.02, 0.01, 0.0)[:dim], turn),
+        mpm.Sphere((0.0,) * dim, 0.1, friction=friction),
+    ]
+    inertia = 0.8 if dim == 2 else (0.6, 0.8, 1.1)
+    bodies = [Body(parts, 30.0, inertia, joint=joint_of(joint, dim)), Body(mpm.Sphere((0.0,) * dim, 0.15), 2.0, 0.02)]
+    place = [AT, (0.68 if walls is None else 0.1, 1.1, 1.0)]
+    turned = [0.2] if dim == 2 else [math.cos(0.2), 0.0, math.sin(0.2), 0.0]
+    rows = torch.zeros(scenes, 2, 6 if dim == 2 else 13, dtype=F64)
+    for k in range(2):
+        rows[:, k, :dim] = torch.tensor(place[k][:dim], dtype=F64)
+        rows[:, k, dim : dim + len(turned)] = torch.tensor(turned, dtype=F64)
+    velocity = rows[..., dim + len(turned) :]
+    velocity[:, 1, 1] = -1.0
+    if joint in ("free", "driven"):
+        velocity[:, 0, :dim] = torch.tensor((0.2, -1.0, 0.1)[:dim], dtype=F64)
+        velocity[:, 0, dim:] = 0.7
+    rows[:, 1, 1] += 0.03 * torch.arange(scenes)
+    return FreeBodies(step, bodies), state.to(device), rows.to(device)
+
+
+def both(bodies, state, rows, n=5, dt=2e-3, wrenches=None):
+    """Results of the op, and of steps from Python: state, rows and report."""
+    results = []
+    for tracked in (False, True):
+        given = rows.clone().requires_grad_(tracked)
+        with torch.set_grad_enabled(tracked):
+            end, after = bodies.advance(state, given, n, dt, wrenches)
+        assert after.requires_grad == tracked
+        bodies.check()
+        results.append((end.v.detach(), end.x.detach(), after.detach(), bodies.report))
+    return results
+
+
+@pytest.mark.parametrize(
+    *in_pairs(
+        dtype=[torch.float32, F64],
+        joint=JOINTS,
+        shape=["sphere", "box", "cup"],
+        scenes=[1, 3],
+        walls=[None, "slip", "mirror"],
+        groups={("kind", "friction"): [("separate", 0.4), ("separate", 0.0), ("slip", 0.4), ("sticky", 0.0)]},
+    )
+)
+def test_equals_steps_from_python(dim, device, kind, friction, dtype, joint, shape, scenes, walls):
+    bodies, state, rows = made(dim, device, dtype, joint, shape, kind, friction, scenes, walls)
+    given = torch.full((len(rows), 2, 3 if dim == 2 else 6), 0.3, dtype=F64, device=device)
+    own, expected = both(bodies, state, rows, wrenches=given)
+    for found, wanted in zip(own[:3], expected[:3], strict=True):
+        torch.testing.assert_close(found, wanted, **OPTIONS[dtype])
+    moved = (own[2] - rows).abs()[..., -3 if dim == 2 else -6 :]
+    assert float(moved[:, 1].max()) > 1e-2  # the ball has met the block
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_report(dim, device, dtype):
+    """Iterations of each scene alone, which may end before those of others; residuals within the tolerance."""
+    bodies, state, rows = made(dim, device, dtype, scenes=2)
+    rows[1, :, 1] += 0.5  # far from the material
+    (*_, own), (*_, expected) = both(bodies, state, rows, n=1)
+    assert own.iterations.shape == (2,)
+    assert own.iterations[0] >= 1
+    assert own.iterations[1] == 0
+    assert own.residual.shape == (2, 2)
+    assert bool(own.converged.all())
+    assert bool(expected.converged.all())
+
+
+def test_momentum_of_body_and_nodes(dim, device):
+    """What the nodes lose the bodies gain, also where no iteration is allowed."""
+    bodies, state, rows = made(dim, device, F64, kind="slip")
+    for most in (0, 20):
+        arguments = list(arguments_of(bodies, state, rows))
+        arguments[8] = most
+        after, end, report = torch.ops.torch_mpm.free_bodies(*arguments)
+        velocity, mass = arguments[:2]
+        lost = (mass[:, None] * (velocity - after)).sum(0)
+        fallen = bodies.gravity_like(rows).flatten() * 2e-3
+        columns = slice(3, 5) if dim == 2 else slice(7, 10)
+        gained = sum(body.mass * ((end - rows)[0, k, columns] - fallen) for k, body in enumerate(bodies.bodies))
+        assert float(lost.abs().max()) > 1e-2
+        torch.testing.assert_close(lost, gained, rtol=0, atol=1e-12)
+        assert (float(report[0, 1:].max()) > 1e-6) == (most == 0)
+
+
+def arguments_of(bodies, state, rows, dt=2e-3):
+    """Arguments of the op in a step from a state."""
+    seen = []
+
+    def hook(blocks, velocity, mass, dt):
+        seen.append((blocks, velocity, mass))
+        return velocity
+
+    bodies.step.on_grid = hook
+    with torch.no_grad():
+        bodies.step(state, dt)
+    bodies.step.on_grid = None
+    blocks, velocity, mass = seen[0]
+    given = bodies.arguments(bodies.tables(velocity), rows, bodies.gravity_like(rows), [], velocity.dtype)
+    return (velocity.contiguous(), mass, *given, dt, *blocks.packed, [], [])
+
+
+def test_op(dim, device):
+    bodies, state, rows = made(dim, device, F64)
+    torch.library.opcheck(torch.ops.torch_mpm.free_bodies, arguments_of(bodies, state, rows))
+
+
+@pytest.mark.parametrize(
+    ("place", "change", "error"),
+    [
+        (1, lambda mass: mass[1:], "mass must have shape"),
+        (1, lambda mass: mass.float(), "mass must be float64"),
+        (2, lambda bodies: bodies[:5], "bodies must be rows, obstacles"),
+        (2, lambda bodies: [bodies[0][:, :1], *bodies[1:]], "rows of bodies must have shape"),
+        (2, lambda bodies: [bodies[0].float(), *bodies[1:]], "rows of bodies must be float64"),
+        (2, lambda bodies: [*bodies[:3], bodies[3][:, 1:], *bodies[4:]], "constants must have shape"),
+        (2, lambda bodies: [*bodies[:5], bodies[5].new_zeros(2, 2)], "gravity of the bodies must have shape"),
+        (2, lambda bodies: [*bodies, bodies[0]], "wrenches must have shape"),
+        (6, lambda owner: [0, 0, 2], "body_owner must be below 2"),
+        (6, lambda owner: owner[1:], "body_owner must have an entry per obstacle"),
+        (7, lambda joint: [0, 4], "body_joint must be 0 to 3"),
+        (7, lambda joint: [], "body_joint must have an entry per body"),
+        (8, lambda most: -1, "max_iterations must be 0 to 1000"),
+        (9, lambda tolerance: 0.0, "tolerance must be positive"),
+        (10, lambda dt: -1.0, "dt must be positive"),
+    ],
+)
+def test_wrong_arguments_of_the_op(place, change, error, device):
+    arguments = list(arguments_of(*made(2, device, F64)))
+    arguments[place] = change(arguments[place])
+    with pytest.raises(RuntimeError, match=error):
+        torch.ops.torch_mpm.free_bodies(*arguments)
+
+
+def test_the_op_has_no_derivative(device):
+    arguments = list(arguments_of(*made(2, device, F64)))
+    arguments[0] = arguments[0].clone().requires_grad_()
+    after, *_ = torch.ops.torch_mpm.free_bodies(*arguments)
+    with pytest.raises(NotImplementedError, match="has no derivative"):
+        after.sum().backward()
