@@ -25,6 +25,12 @@ struct BodiesInputs {
   double tolerance;
 };
 
+// Arguments of a call of many steps, and the rows and the report that its steps write, see BodiesCall.
+struct BodiesOfCall {
+  BodiesInputs in;
+  Tensor rows = absent(), report = absent();
+};
+
 // The bodies of a call of one or many steps, with the tensors that belong to it.
 template <class T, int D>
 class BodiesCall {
@@ -32,6 +38,9 @@ class BodiesCall {
   // `like` has the dtype and device of the nodes.
   BodiesCall(const BodiesInputs& in, const Tensor& like, const PackedLattice& lattice, MPM_CONTACT_WALLS_PARAMETERS,
              int64_t scenes, double dt);
+
+  // Scenes with time steps of their own: factors of dt.
+  void set_scene_dt(const T* factors) { a_.scene_dt = factors; }
 
   // Rows at the end of the steps so far, float64; the most iterations and the largest residuals [B, 1 + K].
   const Tensor& rows() const { return rows_; }
@@ -97,10 +106,10 @@ template <class T, int D>
 void BodiesCall<T, D>::set_obstacles(const BodiesInputs& in, const Tensor& like, const PackedLattice& lattice,
                                      int64_t scenes) {
   const size_t count = in.shape.size();
-  const std::vector<int64_t> all(count, -1);
-  const std::vector<double> start(count, 0), end(count, std::numeric_limits<double>::infinity());
-  a_.contact = obstacle_arguments<T, D>(like, lattice, given_[1], given_[2], in.shape, in.sizes, in.contact, all, start,
-                                        end, {}, 0);
+  constexpr double always = std::numeric_limits<double>::infinity();
+  a_.contact = obstacle_arguments<T, D>(like, lattice, given_[1], given_[2], in.shape, in.sizes, in.contact,
+                                        std::vector<int64_t>(count, -1), std::vector<double>(count),
+                                        std::vector<double>(count, always), {}, 0);
   check_scenes(a_.contact, scenes);
   STD_TORCH_CHECK(a_.contact.obstacles > 0, "bodies must have obstacles, got none");
   a_.given = a_.contact.row;

@@ -32,6 +32,7 @@ struct FreeBodiesArguments {
   double* end = nullptr;                        // at its end, which may be the same
   double* report = nullptr;  // [scenes, 1 + bodies]: the most iterations and the largest residuals so far
   double dt = 0, tolerance = 0;
+  const T* scene_dt = nullptr;  // [scenes] factors of dt, or null
   int max_iterations = 0;
   char* workspace = nullptr;  // of the bytes that `free_bodies_workspace` returns
 };
@@ -121,7 +122,7 @@ class SceneBodies {
     team_.each(a.bodies, [&](int k) {
       const double* const gravity = a.gravity + (a.gravity_rows == 1 ? 0 : int64_t(scene_) * D);
       now[k] = body_now(a.constants[k], a.joint[k], a.begin + body(k) * kBodyRow<D>, gravity,
-                        a.wrench ? a.wrench + body(k) * n : nullptr, a.dt);
+                        a.wrench ? a.wrench + body(k) * n : nullptr, dt());
       for (int i = 0; i < n; i++) s_.U[k * n + i] = now[k].predicted[i];
     });
     team_.sync();
@@ -171,6 +172,7 @@ class SceneBodies {
   SceneNumbers s_;
   const Team& team_;
 
+  MPM_HD double dt() const { return a.scene_dt ? a.dt * double(a.scene_dt[scene_]) : a.dt; }
   MPM_HD int64_t body(int k) const { return int64_t(scene_) * a.bodies + k; }
 
   MPM_HD static double norm(const double* values, int count) {
@@ -240,7 +242,7 @@ class SceneBodies {
   MPM_HD void finish(int k, int iterations) {
     double motion[n];
     for (int i = 0; i < n; i++) motion[i] = now[k].predicted[i] + applied(now[k], s_.impulse + k * n, i);
-    end_of_step(a.constants[k], a.joint[k], now[k], motion, a.dt, a.end + body(k) * kBodyRow<D>);
+    end_of_step(a.constants[k], a.joint[k], now[k], motion, dt(), a.end + body(k) * kBodyRow<D>);
     double* const report = a.report + int64_t(scene_) * (1 + a.bodies);
     const double residual = s_.size[k] / s_.scale[k], before = report[1 + k];
     if (before == before && !(residual <= before)) report[1 + k] = residual;  // NaN stays

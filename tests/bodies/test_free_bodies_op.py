@@ -10,6 +10,7 @@ from pairs import in_pairs
 import torch_mpm as mpm
 from torch_mpm.bodies import Body, Driven, FreeBodies, Hinge, Part, Slider
 from torch_mpm.ops.free_bodies import JOINTS
+from torch_mpm.rollouts.steps import MovingBodies
 
 OPTIONS = {
     torch.float32: {"rtol": 2e-4, "atol": 2e-4},
@@ -64,9 +65,11 @@ def made(dim, device, dtype, joint="free", shape="sphere", kind="separate", fric
     return FreeBodies(step, bodies), state.to(device), rows.to(device)
 
 
-def both(bodies, state, rows, n=5, dt=2e-3, wrenches=None):
-    """Results of the op, and of steps from Python: state, rows and report."""
+def both(bodies, state, rows, n=5, dt=2e-3, wrenches=None, in_one_op=True):
+    """Results of the ops, and of steps from Python: state, rows and report. In one op, or by an op for each step."""
     results = []
+    if not in_one_op:
+        bodies.step.on_particles = lambda state, dt: state
     for tracked in (False, True):
         given = rows.clone().requires_grad_(tracked)
         with torch.set_grad_enabled(tracked):
@@ -82,15 +85,16 @@ def both(bodies, state, rows, n=5, dt=2e-3, wrenches=None):
         dtype=[torch.float32, F64],
         joint=JOINTS,
         shape=["sphere", "box", "cup"],
+        in_one_op=[True, False],
         scenes=[1, 3],
         walls=[None, "slip", "mirror"],
         groups={("kind", "friction"): [("separate", 0.4), ("separate", 0.0), ("slip", 0.4), ("sticky", 0.0)]},
     )
 )
-def test_equals_steps_from_python(dim, device, kind, friction, dtype, joint, shape, scenes, walls):
+def test_equals_steps_from_python(dim, device, kind, friction, dtype, joint, shape, in_one_op, scenes, walls):
     bodies, state, rows = made(dim, device, dtype, joint, shape, kind, friction, scenes, walls)
     given = torch.full((len(rows), 2, 3 if dim == 2 else 6), 0.3, dtype=F64, device=device)
-    own, expected = both(bodies, state, rows, wrenches=given)
+    own, expected = both(bodies, state, rows, wrenches=given, in_one_op=in_one_op)
     for found, wanted in zip(own[:3], expected[:3], strict=True):
         torch.testing.assert_close(found, wanted, **OPTIONS[dtype])
     moved = (own[2] - rows).abs()[..., -3 if dim == 2 else -6 :]
@@ -141,8 +145,7 @@ def arguments_of(bodies, state, rows, dt=2e-3):
         bodies.step(state, dt)
     bodies.step.on_grid = None
     blocks, velocity, mass = seen[0]
-    given = bodies.arguments(bodies.tables(velocity), rows, bodies.gravity_like(rows), [], velocity.dtype)
-    return (velocity.contiguous(), mass, *given, dt, *blocks.packed, [], [])
+    return (velocity.contiguous(), mass, *bodies.given(velocity, rows, None), dt, *blocks.packed, [], [])
 
 
 def test_op(dim, device):
@@ -183,3 +186,104 @@ def test_the_op_has_no_derivative(device):
     after, *_ = torch.ops.torch_mpm.free_bodies(*arguments)
     with pytest.raises(NotImplementedError, match="has no derivative"):
         after.sum().backward()
+
+
+# ---- many steps in one op
+
+
+OPS = {"neo_hookean": {}, "flip": {"flip": 0.9}, "cubic": {"kernel": "cubic"}, "deterministic": {"deterministic": True}}
+
+
+def step_of(device, dtype, grid_options=None, **options):
+    """A step with an obstacle and a block that falls on it, with a body on top; 2-D."""
+    grid = mpm.Grid(0.1, (0.0, 0.0), (2.0, 2.0), **(grid_options or {}))
+    floor = mpm.Box((1.0, 0.3), (1.6, 0.4), friction=0.3)
+    step = mpm.Step(grid, mpm.NeoHookean(E=1e4, nu=0.3), (0.0, -9.8), "slip", boundaries=[floor], **options)
+    points = mpm.seed.box((0.6, 0.52), (1.4, 1.0), grid, per_cell=4)
+    state = mpm.State.at_rest(points, 1000.0, (0.0, -1.0), dtype, device)
+    body = Body(mpm.Sphere((0, 0), 0.2, friction=0.3), 20.0, 0.4)
+    rows = torch.tensor([[[1.05, 1.21, 0.0, 0.3, -1.0, 1.0]]], dtype=F64, device=device)
+    return FreeBodies(step, [body]), state, rows
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("name", OPS)
+@pytest.mark.parametrize("schedule", ["per_step", "sorted_cpu"])
+def test_schedules(name, schedule, device):
+    """With obstacles, and activations that last, for each schedule as by an op for each step."""
+    if device == "cuda" and schedule == "sorted_cpu":
+        pytest.skip("a schedule of the CPU")
+    grid_options = {k: v for k, v in OPS[name].items() if k != "flip"}
+    options = {k: v for k, v in OPS[name].items() if k == "flip"}
+    bodies, state, rows = step_of(device, F64, grid_options, **options)
+    number = mpm.rollouts.plan.SCHEDULES.index(schedule)
+    moving = MovingBodies(*first_of(bodies, state, rows))
+    given = dict(mpm.substeps_arguments(bodies.step, state, 24, 1e-3), schedule=number)
+    *results, after, report = torch.ops.torch_mpm.substeps_with_bodies(
+        [moving.rows, *moving.arguments[0]], *moving.arguments[1], *given.values()
+    )
+    assert torch.ops.torch_mpm.latest_schedule(state.x) == number
+    bodies.step.on_particles = lambda state, dt: state
+    end, expected = bodies.advance(state, rows, 24, 1e-3)
+    torch.testing.assert_close(after, expected, rtol=1e-9, atol=1e-11)
+    torch.testing.assert_close(results[0], end.x, rtol=1e-9, atol=1e-11)
+    assert float(report[:, 1:].max()) <= 1e-12
+
+
+def first_of(bodies, state, rows):
+    (now, *tensors), *others = bodies.given(state.x, rows, None)
+    return now, now.new_zeros(1, 2), (tensors, tuple(others))
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_parts_of_a_rollout_and_clocks(dtype, device):
+    """Many calls of the op, and scenes with times of their own."""
+    bodies, state, rows = step_of(device, dtype)
+    _, at_once = bodies.advance(state, rows, 90, 5e-4)
+    bodies, state, rows = step_of(device, dtype)
+    for n in (1, 30, 59):
+        state, rows = bodies.advance(state, rows, n, 5e-4)
+    torch.testing.assert_close(rows, at_once, **OPTIONS[dtype])
+    bodies, state, rows = step_of(device, dtype)
+    state = state.replace(time=torch.zeros(1, dtype=F64, device=device))
+    torch.testing.assert_close(bodies.advance(state, rows, 90, 5e-4)[1], at_once, **OPTIONS[dtype])
+
+
+@torch.no_grad()
+def test_many_steps_conserve_momentum(dim, device):
+    """In one op, linear momentum of the material and both bodies to rounding; gravity and joints act on neither."""
+    bodies, state, rows = made(dim, device, F64, joint="free", kind="slip")
+    bodies.step.gravity = None
+    place = 3 if dim == 2 else 7
+
+    def momentum(state, rows):
+        of_bodies = sum(body.mass * rows[0, k, place : place + dim] for k, body in enumerate(bodies.bodies))
+        return (state.mass[:, None] * state.v).sum(0) + of_bodies
+
+    state = bodies.step.prepare(state)
+    end, after = bodies.advance(state, rows, 40, 1e-3)
+    bodies.check()
+    assert float((after - rows)[..., place:].abs().max()) > 0.1
+    torch.testing.assert_close(
+        momentum(end, after), momentum(state, rows), rtol=0, atol=1e-12 * float(state.mass.sum())
+    )
+
+
+def test_the_op_of_many_steps_refuses_gradients(device):
+    bodies, state, rows = step_of(device, F64)
+    now, _, (tensors, others) = first_of(bodies, state, rows)
+    given = mpm.substeps_arguments(bodies.step, state, 2, 1e-3)
+    op = torch.ops.torch_mpm.substeps_with_bodies
+    with pytest.raises(RuntimeError, match="bodies are computed without gradients"):
+        op([now, *tensors], *others, *dict(given, resident=False).values())
+    end = op([now, *tensors], *others, *dict(given, v=state.v.clone().requires_grad_()).values())
+    with pytest.raises(NotImplementedError, match="have no derivative"):
+        end[0].sum().backward()
+
+
+def test_the_op_of_many_steps(device):
+    bodies, state, rows = step_of(device, F64)
+    now, _, (tensors, others) = first_of(bodies, state, rows)
+    given = mpm.substeps_arguments(bodies.step, state, 2, 1e-3)
+    torch.library.opcheck(torch.ops.torch_mpm.substeps_with_bodies, ([now, *tensors], *others, *given.values()))

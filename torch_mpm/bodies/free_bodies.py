@@ -28,6 +28,10 @@ from ..ops.autograd import is_tracked
 from ..ops.contact import MAX_OBSTACLES, fusible, walls_beside
 from ..ops.free_bodies import BodyTables, body_tables
 from ..ops.obstacle_tables import values_without_motion
+from ..rollouts.facts import wants_gradient
+from ..rollouts.reasons import why_not_fused
+from ..rollouts.run import computed
+from ..rollouts.steps import MovingBodies, Steps
 from ..state.state import State, check_state
 from ..step.step import Step
 from . import solution
@@ -125,21 +129,43 @@ class FreeBodies:
             )
         if self.step.on_grid is not None:
             raise ValueError("a step with bodies must have no on_grid of its own")
-        now = bodies.double()
-        self._check_joints(now, dt)
-        report = now.new_zeros(len(now), 1 + len(self))
-        for _ in range(n):
-            hook = _Hook(self, now, dt, wrenches)
-            self.step.on_grid = hook
-            try:
-                state = self.step(state, dt)
-            finally:
-                self.step.on_grid = None
-            now, report = hook.rows, torch.maximum(report, hook.report)
+        rows = bodies.double()
+        self._check_joints(rows, dt)
+        state, rows, report = self._advanced(Steps(self.step, n, dt), state, rows, wrenches)
         residual = report[:, 1:]
         self.report = BodyReport(report[:, 0], residual, residual <= TOLERANCE[state.x.dtype])
-        assign(self.obstacles, self.frames.motion(motion_of(now.detach(), self.step.grid.dim)), 0.0)
-        return state, now
+        assign(self.obstacles, self.frames.motion(motion_of(rows.detach(), self.step.grid.dim)), 0.0)
+        return state, rows
+
+    def _advanced(
+        self, steps: Steps, state: State, rows: Tensor, wrenches: Tensor | None
+    ) -> tuple[State, Tensor, Tensor]:
+        """The state, rows and report after steps: by the fused op, or step by step."""
+        moving = self._in_one_op(steps, state, rows, wrenches)
+        with steps.call(state) as end_call, steps.control(state) as end_motion:
+            if moving is not None:
+                state = end_call(end_motion(computed(steps._replace(bodies=moving), state)))
+                return state, moving.rows, moving.report
+            report = rows.new_zeros(len(rows), 1 + len(self))
+            for _ in range(steps.n):
+                hook = _Hook(self, rows, steps.dt, wrenches)
+                self.step.on_grid = hook
+                try:
+                    state = self.step(state, steps.dt)
+                finally:
+                    self.step.on_grid = None
+                rows, report = hook.rows, torch.maximum(report, hook.report)
+            return end_call(end_motion(state)), rows, report
+
+    def _in_one_op(self, steps: Steps, state: State, rows: Tensor, wrenches: Tensor | None) -> MovingBodies | None:
+        """The bodies of steps that the fused op computes; None where it does not."""
+        given = self.given(state.x, rows, wrenches)
+        if given is None or why_not_fused(self.step, state, steps.n, steps.dt) is not None:
+            return None
+        if wants_gradient(steps, state):
+            return None
+        (now, *tensors), *others = given
+        return MovingBodies(now, now.new_zeros(len(now), 1 + len(self)), (tensors, tuple(others)))
 
     def _check_joints(self, rows: Tensor, dt: float) -> None:
         """Raise ValueError for velocities that a joint does not allow, where they can be read."""
@@ -202,36 +228,37 @@ class FreeBodies:
         )
         return made
 
-    def arguments(
-        self, tables: BodyTables, rows: Tensor, gravity: Tensor, wrenches: list[Tensor], dtype: torch.dtype
-    ) -> tuple[Any, ...]:
-        """The bodies as the ops take them, for nodes of a dtype."""
-        dim = self.step.grid.dim
+    def given(self, like: Tensor, rows: Tensor, wrenches: Tensor | None) -> tuple[Any, ...] | None:
+        """The bodies as the ops take them, for particles or nodes of the dtype and device of `like`; None where the
+        bodies are differentiated, or the ops do not support them."""
+        tables, gravity, dim = self.tables(like), self.gravity_like(rows), self.step.grid.dim
+        force = [] if wrenches is None else [wrenches.double()]
+        if tables is None or is_tracked(rows, gravity, *force):
+            return None
         table, data, constants, parts, lists = tables
-        given = [rows, table, data, constants, parts, gravity.reshape(-1, dim).contiguous(), *wrenches]
-        return ([t.detach().contiguous() for t in given], *lists, solution.MAX_ITERATIONS, TOLERANCE[dtype])
+        tensors = [rows, table, data, constants, parts, gravity.reshape(-1, dim), *force]
+        limits = solution.MAX_ITERATIONS, TOLERANCE[like.dtype]
+        return ([t.detach().contiguous() for t in tensors], *lists, *limits)
 
 
 class _Hook:
     """One step of the bodies, as `on_grid` of the step of the material: by the op, or with gradients by `Solution`."""
 
-    def __init__(self, bodies: FreeBodies, rows: Tensor, dt: float, wrenches: Tensor | None) -> None:
+    def __init__(self, bodies: FreeBodies, rows: Tensor, dt: Any, wrenches: Tensor | None) -> None:
         self.of, self.rows, self.dt, self.wrenches = bodies, rows, dt, wrenches
         self.report = rows
 
     def __call__(self, blocks: Blocks, velocity: Tensor, mass: Tensor, dt: Any) -> Tensor:
         """Node velocities after contact with the bodies, whose rows at the end of the step are then known."""
-        bodies, rows, tables = self.of, self.rows, self.of.tables(velocity)
-        gravity = bodies.gravity_like(rows)
-        wrenches = [] if self.wrenches is None else [self.wrenches.double()]
-        if tables is None or is_tracked(velocity, mass, rows, gravity, *wrenches):
-            solution = Solution(bodies, rows, self.dt, self.wrenches)
+        given = self.of.given(velocity, self.rows, self.wrenches)
+        if given is None or is_tracked(velocity, mass):
+            solution = Solution(self.of, self.rows, self.dt, self.wrenches)
             after = solution(blocks, velocity, mass, dt)
             self.rows, self.report = solution.rows, solution.report
             return after
+        walls = walls_beside(self.of.step.walls, blocks.grid)
         after, self.rows, self.report = torch.ops.torch_mpm.free_bodies(
-            *(velocity, mass, *bodies.arguments(tables, rows, gravity, wrenches, velocity.dtype), self.dt),
-            *(*blocks.packed, *walls_beside(bodies.step.walls, blocks.grid)),
+            velocity, mass, *given, self.dt, *blocks.packed, *walls
         )
         return after
 

@@ -82,9 +82,13 @@ def _joint_numbers(body: Body, name: str, dim: int) -> tuple[float, ...]:
 @torch.library.register_fake("torch_mpm::free_bodies")
 def _fake(velocity, mass, bodies, *arguments):
     N, D = sizes(velocity, "velocity", 2)
+    return velocity.new_empty(N, D), *fake_bodies(bodies)
+
+
+def fake_bodies(bodies: list[Tensor]) -> tuple[Tensor, Tensor]:
+    """Rows and report by shape."""
     scenes, count, columns = sizes(bodies[0], "rows of bodies", 3)
-    of_bodies = bodies[0].new_empty(scenes, count, columns), bodies[0].new_empty(scenes, 1 + count)
-    return velocity.new_empty(N, D), *of_bodies
+    return bodies[0].new_empty(scenes, count, columns), bodies[0].new_empty(scenes, 1 + count)
 
 
 def _no_derivative(ctx: Any, *grads: Any) -> None:
