@@ -61,28 +61,50 @@ MPM_HD Vector<double, D> as_double(const Vector<T, D>& v) {
   return r;
 }
 
+// Sets the faces of obstacles that a node meets, and where it is.
+template <class T, int D>
+MPM_HD void set_faces(const ContactArguments<T, D>& a, const BodyNode<T, D>& node, NodePush<T, D>& push) {
+  const Constraints<T, D>& c = node.met.constraints;
+  push.faces = 0;
+  MPM_LOOP for (int i = 0; i < c.count; i++) {
+    if (c.e[i].owner >= 0) push.obstacle[push.faces++] = c.e[i].owner;
+  }
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    push.at[i] = a.lower[i] + double(node.lattice[i] - kPadding) * a.dx;
+  push.position = as_double(node.position);
+}
+
 // Sets the impulses of a node with a mass and a velocity before contact.
 template <class T, int D>
-MPM_HD_CALL void set_impulses(bool wanted, const ContactArguments<T, D>& a, const BodyNode<T, D>& node, const T& mass,
-                              const Vector<T, D>& v, NodePush<T, D>& push) {
+MPM_HD_CALL void set_impulses(bool wanted, const BodyNode<T, D>& node, const T& mass, const Vector<T, D>& v,
+                              NodePush<T, D>& push) {
   if (!wanted) return;
   const Constraints<T, D>& c = node.met.constraints;
   TakenVelocities<T, D> taken;
   take_velocities(c, node.met.sign, v, taken);
-  push.faces = 0;
-  MPM_UNROLL for (int i = 0; i < D; i++)
-    push.at[i] = a.lower[i] + double(node.lattice[i] - kPadding) * a.dx;
-  push.position = as_double(node.position);
   MPM_LOOP for (int i = 0; i < taken.count; i++) {
     const bool is_wall = c.e[i].owner < 0;
-    const int face = is_wall ? 0 : push.faces++;
-    if (!is_wall) push.obstacle[face] = c.e[i].owner;
+    T(&impulse)[D] = push.impulse[is_wall ? 0 : i];
     MPM_UNROLL for (int axis = 0; axis < D; axis++)
-      push.impulse[face][axis] = (is_wall ? push.impulse[face][axis] : T(0)) + mass * taken.taken[i][axis];
+      impulse[axis] = (is_wall ? impulse[axis] : T(0)) + mass * taken.taken[i][axis];
   }
 }
 
-// Sets the derivatives of the impulses by the velocity of a face along an axis, by dual numbers.
+// Sets the derivatives of the impulses of a node that meets one surface, by the velocity of that.
+template <class T, int D>
+MPM_HD void set_slopes_of_one(const BodyNode<T, D>& node, const T& mass, const Vector<T, D>& v, NodePush<T, D>& push) {
+  const Constraint<T, D>& only = node.met.constraints.e[0];
+  const Vector<T, D> u = reflected(node.met.sign, v) + T(-1) * only.velocity;
+  MPM_UNROLL for (int axis = 0; axis < D; axis++) {
+    Vector<T, D> unit = zero_vector<T, D>();
+    unit[axis] = T(1);
+    const Vector<T, D> kept = contact_adjoint(only.kind, u, only.normal, only.friction, unit);
+    MPM_UNROLL for (int by = 0; by < D; by++)
+      push.slope[0][axis][0][by] = mass * node.met.sign[axis] * (kept[by] - unit[by]);
+  }
+}
+
+// The same by the velocity of a face along an axis, for any number of surfaces, by dual numbers.
 template <class T, int D>
 MPM_HD_CALL void set_slopes(bool wanted, const BodyNode<T, D>& node, const T& mass, const Vector<T, D>& v, int by_face,
                             int by_axis, NodePush<T, D>& push) {

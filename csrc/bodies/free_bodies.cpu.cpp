@@ -1,5 +1,6 @@
 #include "bodies/free_bodies.h"
 
+#include <algorithm>
 #include <vector>
 
 #include "cpu/parallel.h"
@@ -13,8 +14,10 @@ constexpr int64_t kGrain = 64;  // slots below which a range is not split
 // One thread for all of a scene.
 template <class T, int D>
 struct OneThread {
+  static constexpr int n = kMotions<D>;
   const FreeBodiesArguments<T, D>& a;
-  std::vector<BodyNode<T, D>> nodes;  // of the scene, in the order of the slots
+  // Of the scene, in the order of the slots; each pass sets the velocities of their surfaces.
+  mutable std::vector<BodyNode<T, D>> nodes;
 
   template <class F>
   void each(int count, const F& f) const {
@@ -22,56 +25,61 @@ struct OneThread {
   }
   void sync() const {}
 
-  template <class F>
-  void each_node(const ObstacleRow<T, D>* rows, const F& f) const {
-    for (const BodyNode<T, D>& found : nodes) {
-      BodyNode<T, D> node = found;
+  template <class Visit>
+  void each_node(const ObstacleRow<T, D>* rows, const Visit& visit) const {
+    for (BodyNode<T, D>& node : nodes) {
       set_surface_velocities(rows, node);
-      f(node, a.contact.mass[node.node * a.contact.mass_stride], load_node<T, D>(a.velocity, a.stride, node.node));
+      visit(node, a.contact.mass[node.node * a.contact.mass_stride], load_node<T, D>(a.velocity, a.stride, node.node));
     }
   }
 
   template <class Scene>
   void add_up_impulses(const Scene& scene, double* sums) const {
-    constexpr int n = kMotions<D>;
-    for (int i = 0; i < a.bodies * n; i++) sums[i] = 0;
+    std::fill_n(sums, a.bodies * n, 0.0);
     each_node(scene.rows, [&](const BodyNode<T, D>& node, const T& mass, const Vector<T, D>& v) {
       NodePush<T, D> push;
-      set_impulses(true, a.contact, node, mass, v, push);
+      set_faces(a.contact, node, push);
+      set_impulses(true, node, mass, v, push);
       for (int face = 0; face < push.faces; face++) {
         const int k = a.owner[push.obstacle[face]];
-        for (int i = 0; i < n; i++) sums[k * n + i] += impulse_along(push, face, scene.now[k], i);
+        MPM_UNROLL for (int i = 0; i < n; i++)
+          sums[k * n + i] += impulse_along(push, face, scene.now[k], i);
       }
     });
   }
 
   template <class Scene>
   void add_up_slopes(const Scene& scene, double* sums) const {
-    constexpr int n = kMotions<D>;
     const int m = a.bodies * n;
-    for (int i = 0; i < m * m; i++) sums[i] = 0;
+    std::fill_n(sums, m * m, 0.0);
     each_node(scene.rows, [&](const BodyNode<T, D>& node, const T& mass, const Vector<T, D>& v) {
       NodePush<T, D> push;
-      set_impulses(true, a.contact, node, mass, v, push);
+      set_faces(a.contact, node, push);
+      const bool one = node.met.constraints.count == 1;
+      if (one) set_slopes_of_one(node, mass, v, push);
       for (int by = 0; by < push.faces; by++) {
-        for (int axis = 0; axis < D; axis++) set_slopes(true, node, mass, v, by, axis, push);
-        const int l = a.owner[push.obstacle[by]];
-        for (int j = 0; j < n; j++)
-          for (int face = 0; face < push.faces; face++) {
-            const int k = a.owner[push.obstacle[face]];
-            const Vector<double, D> slope = impulse_slope(push, face, by, scene.now[l], j);
-            for (int i = 0; i < n; i++) sums[(k * n + i) * m + l * n + j] += slope_along(push, slope, scene.now[k], i);
-          }
+        for (int axis = 0; axis < D && !one; axis++) set_slopes(true, node, mass, v, by, axis, push);
+        for (int face = 0; face < push.faces; face++)
+          add_slopes(push, face, by, a.owner[push.obstacle[face]], a.owner[push.obstacle[by]], scene.now, sums, m);
       }
     });
   }
 
+  // Derivatives of the impulse of a face of body k by the motion of body l, which owns the face `by`.
+  static void add_slopes(const NodePush<T, D>& push, int face, int by, int k, int l, const BodyNow<D>* now,
+                         double* sums, int m) {
+    MPM_UNROLL for (int j = 0; j < n; j++) {
+      const Vector<double, D> slope = impulse_slope(push, face, by, now[l], j);
+      MPM_UNROLL for (int i = 0; i < n; i++)
+        sums[(k * n + i) * m + l * n + j] += slope_along(push, slope, now[k], i);
+    }
+  }
+
   template <class Scene>
   void change_nodes(const Scene& scene) const {
-    each_node(scene.rows, [&](const BodyNode<T, D>& node, const T&, const Vector<T, D>& v) {
-      Vector<T, D> after = v;
-      change_velocity(true, node, after);
-      for (int i = 0; i < D; i++) a.velocity[node.node * a.stride + i] = after[i];
+    each_node(scene.rows, [&](const BodyNode<T, D>& node, const T&, Vector<T, D> v) {
+      change_velocity(true, node, v);
+      std::copy_n(v.e, D, a.velocity + node.node * a.stride);
     });
   }
 };
@@ -79,8 +87,11 @@ struct OneThread {
 // Finds the nodes of a slot that are in contact.
 template <class T, int D>
 void find_nodes(const FreeBodiesArguments<T, D>& a, int slot, std::vector<BodyNode<T, D>>& nodes) {
-  const SlotPoses<T, D> poses(a.contact, slot);
   const int first = slot * kBlockNodes<D>;
+  bool any = false;
+  for (int local = 0; local < kBlockNodes<D>; local++) any |= has_mass(a.contact, first + local);
+  if (!any) return;
+  const SlotPoses<T, D> poses(a.contact, slot);
   for (int local = 0; local < kBlockNodes<D> && poses.s.near; local++) {
     if (!has_mass(a.contact, first + local)) continue;
     NodeContact<T, D> contact;

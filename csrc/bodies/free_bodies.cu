@@ -6,7 +6,8 @@
 namespace mpm::cuda {
 namespace {
 
-constexpr int kThreads = 256, kWarps = kThreads / 32;
+// Threads of a block: few for many scenes, so that their latencies overlap.
+constexpr int kFewThreads = 128, kManyThreads = 512, kManyScenes = 256;
 // Nodes per slot, on average over a scene, whose surfaces are stored; those of others are found in every pass.
 constexpr int kRoom = 16;
 // Nodes whose impulses are in shared memory at a time, whole warps.
@@ -52,8 +53,8 @@ struct BodiesMemory {
   static int64_t bytes_of_scene(const FreeBodiesArguments<T, D>& a) {
     return a.bodies * int64_t(sizeof(BodyNow<D>)) + numbers_of_scene(a) * int64_t(sizeof(double));
   }
-  int64_t shared_bytes(const FreeBodiesArguments<T, D>& a) const {
-    return int64_t(sizeof(double)) * kThreads + kTile<T> * int64_t(sizeof(NodePush<T, D>)) +
+  int64_t shared_bytes(const FreeBodiesArguments<T, D>& a, int threads) const {
+    return int64_t(sizeof(double)) * threads + kTile<T> * int64_t(sizeof(NodePush<T, D>)) +
            (shares ? bytes_of_scene(a) : 0);
   }
 };
@@ -126,7 +127,7 @@ __device__ __noinline__ void search_node(bool wanted, const ContactArguments<T, 
 }
 
 // The threads of a block with the nodes of their scene, as SceneBodies has it.
-template <class T, int D>
+template <int kThreads, class T, int D>
 struct BlockTeam {
   const FreeBodiesArguments<T, D>& a;
   const NearObstacles* near;
@@ -138,7 +139,8 @@ struct BlockTeam {
   int* of_warps;          // [kWarps] in shared memory
   int count = 0;          // of nodes in contact
 
-  static constexpr int n = kMotions<D>;
+  static constexpr int n = kMotions<D>, kWarps = kThreads / 32;
+  static_assert(kThreads % kTile<T> == 0);
 
   template <class F>
   __device__ void each(int items, const F& f) const {
@@ -291,12 +293,13 @@ struct BlockTeam {
     Vector<T, D> v;
     load(wanted, first + i, scene, node, mass, v);
     if (any_of_warp(wanted)) {
-      set_impulses(wanted, a.contact, node, mass, v, push[i]);
+      set_impulses(wanted, node, mass, v, push[i]);
       join_warp();
     }
+    if (wanted) set_faces(a.contact, node, push[i]);
   }
 
-  // Impulses of a tile and their derivatives, by a thread for each node and axis of a face.
+  // Derivatives of the impulses of a tile, by a thread for each node and axis of a face.
   template <class Scene>
   __device__ void fill_slopes(const Scene& scene, int first, int size) const {
     const int i = threadIdx.x % kTile<T>;
@@ -305,14 +308,14 @@ struct BlockTeam {
     T mass;
     Vector<T, D> v;
     load(wanted, first + i, scene, node, mass, v);
-    const bool leads = wanted && threadIdx.x < kTile<T>;
-    if (any_of_warp(leads)) {
-      set_impulses(leads, a.contact, node, mass, v, push[i]);
-      join_warp();
+    const bool one = wanted && node.met.constraints.count == 1;
+    if (wanted && threadIdx.x < kTile<T>) {
+      set_faces(a.contact, node, push[i]);
+      if (one) set_slopes_of_one(node, mass, v, push[i]);
     }
     for (int seed = threadIdx.x / kTile<T>; seed < D * D; seed += kThreads / kTile<T>) {
       const Constraints<T, D>& c = node.met.constraints;
-      const bool acts = wanted && seed / D < c.count && c.e[seed / D].owner >= 0;
+      const bool acts = wanted && !one && seed / D < c.count && c.e[seed / D].owner >= 0;
       if (any_of_warp(acts)) {
         set_slopes(acts, node, mass, v, seed / D, seed % D, push[i]);
         join_warp();
@@ -338,11 +341,11 @@ struct BlockTeam {
   }
 };
 
-template <class T, int D>
+template <int kThreads, class T, int D>
 __global__ void __launch_bounds__(kThreads)
     free_bodies_kernel(const __grid_constant__ FreeBodiesArguments<T, D> a, const BodiesMemory<T, D> memory) {
   extern __shared__ double shared[];
-  __shared__ int of_warps[kWarps];
+  __shared__ int of_warps[kThreads / 32];
   double* const numbers_here = shared + kThreads;
   const int scene = blockIdx.x, m = a.bodies * kMotions<D>;
   const int64_t count = SceneNumbers::count(a.bodies, m);
@@ -351,18 +354,25 @@ __global__ void __launch_bounds__(kThreads)
       memory.shares ? reinterpret_cast<BodyNow<D>*>(numbers_here + count) : memory.now + int64_t(scene) * a.bodies;
   char* const rest = memory.shares ? reinterpret_cast<char*>(now + a.bodies) : reinterpret_cast<char*>(numbers_here);
   const SceneSlots slots = slots_of_scene(a, scene);
-  BlockTeam<T, D> team{a,
-                       memory.near,
-                       memory.list + slots.before() * kBlockNodes<D>,
-                       memory.nodes + slots.before() * kRoom,
-                       slots.total() * kRoom,
-                       reinterpret_cast<NodePush<T, D>*>(rest),
-                       shared,
-                       of_warps};
-  SceneBodies<T, D, BlockTeam<T, D>> bodies(a, scene, now, numbers, team);
+  BlockTeam<kThreads, T, D> team{a,
+                                 memory.near,
+                                 memory.list + slots.before() * kBlockNodes<D>,
+                                 memory.nodes + slots.before() * kRoom,
+                                 slots.total() * kRoom,
+                                 reinterpret_cast<NodePush<T, D>*>(rest),
+                                 shared,
+                                 of_warps};
+  SceneBodies<T, D, BlockTeam<kThreads, T, D>> bodies(a, scene, now, numbers, team);
   bodies.begin();
   team.find_nodes(slots, memory.near);
   bodies.solve();
+}
+
+template <int kThreads, class T, int D>
+void run(const FreeBodiesArguments<T, D>& a, Stream stream) {
+  const BodiesMemory<T, D> memory(a, a.workspace);
+  launch(free_bodies_kernel<kThreads, T, D>, unsigned(a.scenes), kThreads, size_t(memory.shared_bytes(a, kThreads)),
+         stream, a, memory);
 }
 
 }  // namespace
@@ -374,8 +384,7 @@ int64_t free_bodies_workspace(const FreeBodiesArguments<T, D>& a) {
 
 template <class T, int D>
 void free_bodies(const FreeBodiesArguments<T, D>& a, Stream stream) {
-  const BodiesMemory<T, D> memory(a, a.workspace);
-  launch(free_bodies_kernel<T, D>, unsigned(a.scenes), kThreads, size_t(memory.shared_bytes(a)), stream, a, memory);
+  a.scenes < kManyScenes ? run<kManyThreads>(a, stream) : run<kFewThreads>(a, stream);
 }
 
 MPM_INSTANTIATE_SIZE(free_bodies_workspace, FreeBodiesArguments)

@@ -14,6 +14,9 @@ from ..errors import check_number, check_vector, shape_of
 from ..geometry.values import filled
 from .exchange import VELOCITY, Part, parts_of, swirl
 
+NOT_ALLOWED = 1e-5
+"""Largest share of a velocity that a joint does not allow."""
+
 
 class Joint:
     """Motion that a body is free to have. This one allows all of it."""
@@ -133,6 +136,22 @@ class Body:
         self.joint.check_dimension(dim)
         for part in self.parts:
             part.check_dimension(dim)
+
+    def moves_as_its_joint(self, position: Tensor, velocity: Tensor) -> bool:
+        """Whether the joint allows velocities [B, n] at positions [B, D], up to a share of `NOT_ALLOWED`; reads them.
+
+        The projection on what it allows is by a frame that is not turned: a velocity that is allowed is its own
+        projection for any inertia.
+        """
+        directions = self.joint.directions(position)
+        if directions is None:
+            return True
+        count, dim = position.shape
+        matrix = self.mass_matrix(torch.eye(dim, dtype=position.dtype).expand(count, -1, -1))
+        allowed = (mobility(matrix, directions) @ matrix @ velocity[..., None])[..., 0]
+        weights = matrix.diagonal(dim1=1, dim2=2)
+        wrong, whole = ((v.square() * weights).sum(1) for v in (velocity - allowed, velocity))
+        return not bool((wrong > NOT_ALLOWED**2 * whole).any())
 
     def mass_matrix(self, turn: Tensor) -> Tensor:
         """Mass and inertia [B, n, n] by the rotation of the frame [B, D, D], n = 3 in 2-D and 6 in 3-D."""

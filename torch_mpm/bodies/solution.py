@@ -19,7 +19,7 @@ from ..grid.grid import Blocks
 from ..ops.autograd import dispatch, graph_at_once
 from ..ops.contact import obstacle_arguments, packed_rows, walls_beside
 from ..ops.impulses import with_moment
-from .body import Body, Driven, Joint, mobility
+from .body import Body, mobility
 from .exchange import POSE, Motion, assign, motion_of, moved, rotation_of, swirl
 
 if TYPE_CHECKING:
@@ -31,8 +31,6 @@ ITERATIONS_ON_CUDA = 8
 """Iterations of steps from Python where the host does not read the residual: most steps need 1 to 4."""
 TOLERANCE = {torch.float64: 1e-12, torch.float32: 1e-5}
 """Residual of velocities, relative to those of the bodies and by the impulses, by the dtype of the nodes."""
-NOT_ALLOWED = 1e-5
-"""Largest share of a velocity that a joint does not allow."""
 
 
 class Solution:
@@ -69,19 +67,6 @@ class Solution:
         if wrenches is not None:
             force = force + wrenches.double()
         return velocity + self.dt * self._applied(force)
-
-    def check_joints(self) -> None:
-        """Raise ValueError for velocities at the beginning that a joint does not allow, where they can be read."""
-        bodies = self.of.bodies
-        if not is_readable(self.begin) or all(type(body.joint) in (Joint, Driven) for body in bodies):
-            return
-        own = self.begin[..., POSE[self.dim] :].detach()
-        allowed = self._applied((self.mass @ own[..., None])[..., 0])
-        wrong = self.size_of(own - allowed) > NOT_ALLOWED * self.size_of(own)
-        for k, body in enumerate(bodies):
-            if not isinstance(body.joint, Driven) and bool(wrong[:, k].any()):
-                kind = type(body.joint).__name__.lower()
-                raise ValueError(f"bodies must have velocities that their joints allow, and body {k} is on a {kind}")
 
     def __call__(self, blocks: Blocks, velocity: Tensor, mass: Tensor, dt: Any) -> Tensor:
         """Node velocities after contact with the bodies, whose rows at the end of the step are then known."""
