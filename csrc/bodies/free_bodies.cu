@@ -9,7 +9,7 @@ namespace {
 // Threads of a block: few for many scenes, so that their latencies overlap.
 constexpr int kFewThreads = 128, kManyThreads = 512, kManyScenes = 256;
 // Nodes per slot, on average over a scene, whose surfaces are stored; those of others are found in every pass.
-constexpr int kRoom = 16;
+constexpr int kRoom = 8;
 // Nodes whose impulses are in shared memory at a time, whole warps.
 template <class T>
 constexpr int kTile = sizeof(T) == 4 ? 64 : 32;

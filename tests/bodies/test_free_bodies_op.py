@@ -10,7 +10,7 @@ from pairs import in_pairs
 import torch_mpm as mpm
 from torch_mpm.bodies import Body, Driven, FreeBodies, Hinge, Part, Slider
 from torch_mpm.ops.free_bodies import JOINTS
-from torch_mpm.rollouts.steps import MovingBodies
+from torch_mpm.rollouts.plan import SCHEDULES
 
 OPTIONS = {
     torch.float32: {"rtol": 2e-4, "atol": 2e-4},
@@ -132,6 +132,30 @@ def test_momentum_of_body_and_nodes(dim, device):
         assert (float(report[0, 1:].max()) > 1e-6) == (most == 0)
 
 
+@pytest.mark.parametrize("kind", ["slip", "sticky"])
+def test_a_body_around_all_of_the_material(dim, device, kind):
+    """All nodes are in contact, more than the kernel on CUDA stores the surfaces of."""
+    bodies, state, rows = made(dim, device, F64)
+    around = Body(mpm.Sphere((0.0,) * dim, 1.5, kind, friction=0.2), 100.0, 5.0)
+    bodies = FreeBodies(bodies.step, [around, bodies.bodies[1]])
+    own, expected = both(bodies, state, rows, n=3)
+    for found, wanted in zip(own[:3], expected[:3], strict=True):
+        torch.testing.assert_close(found, wanted, **OPTIONS[F64])
+
+
+@torch.no_grad()
+def test_results_do_not_depend_on_the_number_of_threads():
+    """Nor do those of a second call, bit by bit."""
+    arguments = arguments_of(*made(3, "cpu", torch.float32, scenes=3))
+    results = []
+    for threads in (1, 2, 2):
+        torch.set_num_threads(threads)
+        results.append(torch.ops.torch_mpm.free_bodies(*arguments))
+    for others in results[1:]:
+        for found, expected in zip(others, results[0], strict=True):
+            assert torch.equal(found, expected)
+
+
 def arguments_of(bodies, state, rows, dt=2e-3):
     """Arguments of the op in a step from a state."""
     seen = []
@@ -191,42 +215,56 @@ def test_the_op_has_no_derivative(device):
 # ---- many steps in one op
 
 
-OPS = {"neo_hookean": {}, "flip": {"flip": 0.9}, "cubic": {"kernel": "cubic"}, "deterministic": {"deterministic": True}}
+CASES = {
+    "plain": {},
+    "flip": {"flip": 0.9},
+    "cubic": {"kernel": "cubic"},
+    "deterministic": {"deterministic": True},
+    "impulses": {},
+    "heat": {},
+}
 
 
-def step_of(device, dtype, grid_options=None, **options):
+def step_of(device, dtype, case="plain"):
     """A step with an obstacle and a block that falls on it, with a body on top; 2-D."""
-    grid = mpm.Grid(0.1, (0.0, 0.0), (2.0, 2.0), **(grid_options or {}))
+    options = CASES[case]
+    grid = mpm.Grid(0.1, (0.0, 0.0), (2.0, 2.0), **({} if case == "flip" else options))
     floor = mpm.Box((1.0, 0.3), (1.6, 0.4), friction=0.3)
-    step = mpm.Step(grid, mpm.NeoHookean(E=1e4, nu=0.3), (0.0, -9.8), "slip", boundaries=[floor], **options)
+    heat = mpm.Heat(grid, 1.0, 100.0) if case == "heat" else None
+    flip = options if case == "flip" else {}
+    law = mpm.NeoHookean(E=1e4, nu=0.3)
+    step = mpm.Step(grid, law, (0.0, -9.8), "slip", boundaries=[floor], heat=heat, **flip)
     points = mpm.seed.box((0.6, 0.52), (1.4, 1.0), grid, per_cell=4)
     state = mpm.State.at_rest(points, 1000.0, (0.0, -1.0), dtype, device)
+    if case == "impulses":
+        state = step.with_impulses(state)
+    if case == "heat":
+        state = state.replace(temperature=300 + 50 * state.x[:, 0])
     body = Body(mpm.Sphere((0, 0), 0.2, friction=0.3), 20.0, 0.4)
     rows = torch.tensor([[[1.05, 1.21, 0.0, 0.3, -1.0, 1.0]]], dtype=F64, device=device)
     return FreeBodies(step, [body]), state, rows
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("name", OPS)
+@pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("schedule", ["per_step", "sorted_cpu"])
-def test_schedules(name, schedule, device):
+def test_schedules(case, schedule, device):
     """With obstacles, and activations that last, for each schedule as by an op for each step."""
     if device == "cuda" and schedule == "sorted_cpu":
         pytest.skip("a schedule of the CPU")
-    grid_options = {k: v for k, v in OPS[name].items() if k != "flip"}
-    options = {k: v for k, v in OPS[name].items() if k == "flip"}
-    bodies, state, rows = step_of(device, F64, grid_options, **options)
-    number = mpm.rollouts.plan.SCHEDULES.index(schedule)
-    moving = MovingBodies(*first_of(bodies, state, rows))
-    given = dict(mpm.substeps_arguments(bodies.step, state, 24, 1e-3), schedule=number)
-    *results, after, report = torch.ops.torch_mpm.substeps_with_bodies(
-        [moving.rows, *moving.arguments[0]], *moving.arguments[1], *given.values()
-    )
+    bodies, state, rows = step_of(device, F64, case)
+    number = SCHEDULES.index(schedule)
+    now, _, (tensors, others) = first_of(bodies, state, rows)
+    given = dict(mpm.substeps_arguments(bodies.step, bodies.step.prepare(state), 24, 1e-3), schedule=number)
+    *results, after, report = torch.ops.torch_mpm.substeps_with_bodies([now, *tensors], *others, *given.values())
     assert torch.ops.torch_mpm.latest_schedule(state.x) == number
     bodies.step.on_particles = lambda state, dt: state
     end, expected = bodies.advance(state, rows, 24, 1e-3)
     torch.testing.assert_close(after, expected, rtol=1e-9, atol=1e-11)
     torch.testing.assert_close(results[0], end.x, rtol=1e-9, atol=1e-11)
+    torch.testing.assert_close(results[7], end.impulse, rtol=1e-9, atol=1e-9)
+    if case == "heat":
+        torch.testing.assert_close(results[10][:, 0], end.temperature, rtol=1e-9, atol=0)
     assert float(report[:, 1:].max()) <= 1e-12
 
 
