@@ -5,8 +5,8 @@
 
 Balls: two balls on an elastic block in 3-D, one scene. Vessels: 735 particles of water in each scene, in a cup that
 swings on a hinge, and beside it a glass that slides, both of three boxes, in 2-D; as obstacles at rest ("obstacles"),
-and as bodies. Steps are those of one call, by the wall clock, with one wait for the device at the end. "Python" are the
-same steps as they are with a gradient by the bodies, forward only.
+and as bodies. Steps are those of one call, by the wall clock, with one wait for the device at the end. "Tracked" are steps
+whose gradient is wanted, forward only.
 """
 
 from __future__ import annotations
@@ -76,9 +76,9 @@ def times(
     n: int,
     dt: float,
     clock: Clock,
-    python: bool,
+    tracks: bool,
 ) -> list[object]:
-    """A row of the table: ms per step without bodies, with them, and from Python, and the share of the bodies."""
+    """A row of the table: ms per step without bodies, with them, their share, and ms with a graph."""
     step, state, bodies, rows = made
     with torch.no_grad(), clock:
         without = clock.steps(lambda: mpm.rollout(step, state, n, dt), n).fastest_ms
@@ -87,7 +87,7 @@ def times(
         step.check(mpm.rollout(step, state, n, dt))
     given = rows.clone().requires_grad_()
     few = 5
-    slow = clock.steps(lambda: bodies.advance(state, given, few, dt), few).fastest_ms if python else None
+    slow = clock.steps(lambda: bodies.advance(state, given, few, dt), few).fastest_ms if tracks else None
     dtype = str(state.x.dtype).removeprefix("torch.")
     return [name, len(rows), len(state), dtype, without, own, f"{100 * (own / without - 1):.0f}", slow]
 
@@ -104,13 +104,13 @@ def main() -> None:
     clock = Clock(arguments.device, samples, budget=20.0)
     rows = []
     for dtype in (torch.float32, torch.float64):
-        rows.append(times("balls", balls(dtype, arguments.device), n, 1e-3, clock, python=True))
+        rows.append(times("balls", balls(dtype, arguments.device), n, 1e-3, clock, tracks=True))
         for count in scenes:
             made = vessels(count, dtype, arguments.device)
-            rows.append(times("vessels", made, n, 1e-4, clock, python=count * 735 < 20000))
+            rows.append(times("vessels", made, n, 1e-4, clock, tracks=count * 735 < 20000))
             common.release_memory()
     print(common.describe(common.environment(arguments.device)))
-    header = ("case", "scenes", "particles", "dtype", "without [ms]", "with bodies [ms]", "bodies [%]", "Python [ms]")
+    header = ("case", "scenes", "particles", "dtype", "without [ms]", "with bodies [ms]", "bodies [%]", "tracked [ms]")
     print(common.table(header, rows))
 
 

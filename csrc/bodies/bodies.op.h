@@ -42,6 +42,12 @@ class BodiesCall {
   // Scenes with time steps of their own: factors of dt.
   void set_scene_dt(const T* factors) { a_.scene_dt = factors; }
 
+  // Lets steps store their solution, see FreeBodiesArguments.
+  void set_solution(const Tensor& motion, const Tensor& slopes) {
+    a_.motion = static_cast<double*>(motion.data_ptr());
+    a_.slopes = static_cast<double*>(slopes.data_ptr());
+  }
+
   // Rows at the end of the steps so far, float64; the most iterations and the largest residuals [B, 1 + K].
   const Tensor& rows() const { return rows_; }
   const Tensor& report() const { return report_; }

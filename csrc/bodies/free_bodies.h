@@ -31,6 +31,8 @@ struct FreeBodiesArguments {
   const double* begin = nullptr;                // rows [scenes, bodies, kBodyRow] at the beginning of the step, and
   double* end = nullptr;                        // at its end, which may be the same
   double* report = nullptr;  // [scenes, 1 + bodies]: the most iterations and the largest residuals so far
+  // The solution U [scenes, bodies, kMotions], and dp/dU there [scenes, m, m] of the m unknowns of a scene; or null.
+  double *motion = nullptr, *slopes = nullptr;
   double dt = 0, tolerance = 0;
   const T* scene_dt = nullptr;  // [scenes] factors of dt, or null
   int max_iterations = 0;
@@ -163,6 +165,7 @@ class SceneBodies {
       team_.sync();
     }
     move_parts(s_.U);
+    if (a.motion) write_solution(has_slopes);
     team_.change_nodes(*this);
     team_.each(a.bodies, [&](int k) { finish(k, iterations); });
   }
@@ -236,6 +239,14 @@ class SceneBodies {
       s_.scale[k] = max(s_.scale[k], rounded * size_of_motion(now[k], s_.U + k * n) / a.tolerance);
     });
     solve_in_place(team_, s_.matrix, m_);
+  }
+
+  MPM_HD void write_solution(bool has_slopes) {
+    if (!has_slopes) team_.add_up_slopes(*this, s_.slopes);
+    const int64_t first = int64_t(scene_) * m_;
+    team_.each(m_, [&](int i) { a.motion[first + i] = s_.U[i]; });
+    team_.each(m_ * m_, [&](int e) { a.slopes[first * m_ + e] = s_.slopes[e]; });
+    team_.sync();
   }
 
   // The row of a body at the end of the step, by its impulses, and its report.

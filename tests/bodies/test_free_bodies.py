@@ -342,6 +342,7 @@ def test_gradients_equal_differences(device, joint):
         (lambda step: FreeBodies(step, [Body(mpm.Sphere((0, 0), 0.1, end=1.0), 1.0, 1.0)]), "at all times"),
         (lambda step: FreeBodies(step, [Body(mpm.SDF(lambda x: x[:, 0], (0, 0)), 1.0, 1.0)]), "Sampled.of"),
         (lambda step: Slider((0.0, 0.0)), "positive length"),
+        (lambda step: Body(mpm.Sphere((0, 0), 0.1), 1.0, 1.0, joint=OwnJoint((1.0, 0.0))), "joint must be a Hinge"),
         (lambda step: FreeBodies(step, [Body(_hooked(), 1.0, 1.0)]), "no hooks"),
     ],
 )
@@ -349,6 +350,10 @@ def test_wrong_arguments(make, error):
     step, _ = material(2)
     with pytest.raises((TypeError, ValueError), match=error):
         make(step)
+
+
+class OwnJoint(Slider):
+    """A joint that the kernels do not know."""
 
 
 def _hooked():

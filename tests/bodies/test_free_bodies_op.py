@@ -1,14 +1,16 @@
-"""The op of free bodies against the same steps from Python, which differentiate the contact of the nodes."""
+"""The ops of free bodies against Newton's method in torch, which differentiates the contact of the nodes."""
 
 import math
 
 import pytest
 import torch
 from cases.impulses import F64
+from oracle import free_bodies as reference
 from pairs import in_pairs
 
 import torch_mpm as mpm
 from torch_mpm.bodies import Body, Driven, FreeBodies, Hinge, Part, Slider
+from torch_mpm.bodies.solution import Solution
 from torch_mpm.ops.free_bodies import JOINTS
 from torch_mpm.rollouts.plan import SCHEDULES
 
@@ -65,19 +67,17 @@ def made(dim, device, dtype, joint="free", shape="sphere", kind="separate", fric
     return FreeBodies(step, bodies), state.to(device), rows.to(device)
 
 
-def both(bodies, state, rows, n=5, dt=2e-3, wrenches=None, in_one_op=True):
-    """Results of the ops, and of steps from Python: state, rows and report. In one op, or by an op for each step."""
-    results = []
+def compare(bodies, state, rows, n=5, wrenches=None, in_one_op=True, dt=2e-3):
+    """The rows and the report of steps in one op, or by an op for each step, which equal those of the oracle."""
+    wanted, expected, _ = reference.steps(bodies, state, rows, n, dt, wrenches)
     if not in_one_op:
         bodies.step.on_particles = lambda state, dt: state
-    for tracked in (False, True):
-        given = rows.clone().requires_grad_(tracked)
-        with torch.set_grad_enabled(tracked):
-            end, after = bodies.advance(state, given, n, dt, wrenches)
-        assert after.requires_grad == tracked
-        bodies.check()
-        results.append((end.v.detach(), end.x.detach(), after.detach(), bodies.report))
-    return results
+    with torch.no_grad():
+        end, after = bodies.advance(state, rows, n, dt, wrenches)
+    bodies.check()
+    for found, exact in ((after, expected), (end.v, wanted.v), (end.x, wanted.x)):
+        torch.testing.assert_close(found, exact, **OPTIONS[state.x.dtype])
+    return after
 
 
 @pytest.mark.parametrize(
@@ -94,10 +94,8 @@ def both(bodies, state, rows, n=5, dt=2e-3, wrenches=None, in_one_op=True):
 def test_equals_steps_from_python(dim, device, kind, friction, dtype, joint, shape, in_one_op, scenes, walls):
     bodies, state, rows = made(dim, device, dtype, joint, shape, kind, friction, scenes, walls)
     given = torch.full((len(rows), 2, 3 if dim == 2 else 6), 0.3, dtype=F64, device=device)
-    own, expected = both(bodies, state, rows, wrenches=given, in_one_op=in_one_op)
-    for found, wanted in zip(own[:3], expected[:3], strict=True):
-        torch.testing.assert_close(found, wanted, **OPTIONS[dtype])
-    moved = (own[2] - rows).abs()[..., -3 if dim == 2 else -6 :]
+    after = compare(bodies, state, rows, wrenches=given, in_one_op=in_one_op)
+    moved = (after - rows).abs()[..., -3 if dim == 2 else -6 :]
     assert float(moved[:, 1].max()) > 1e-2  # the ball has met the block
 
 
@@ -106,13 +104,37 @@ def test_report(dim, device, dtype):
     """Iterations of each scene alone, which may end before those of others; residuals within the tolerance."""
     bodies, state, rows = made(dim, device, dtype, scenes=2)
     rows[1, :, 1] += 0.5  # far from the material
-    (*_, own), (*_, expected) = both(bodies, state, rows, n=1)
-    assert own.iterations.shape == (2,)
-    assert own.iterations[0] >= 1
-    assert own.iterations[1] == 0
-    assert own.residual.shape == (2, 2)
-    assert bool(own.converged.all())
-    assert bool(expected.converged.all())
+    with torch.no_grad():
+        bodies.advance(state, rows, 1, 2e-3)
+    report, (*_, expected) = bodies.report, reference.steps(bodies, state, rows[:, :], 1, 2e-3)
+    assert report.iterations[0] == expected[0, 0] >= 1
+    assert report.iterations[1] == 0
+    assert report.residual.shape == (2, 2)
+    assert bool(report.converged.all())
+
+
+@pytest.mark.parametrize("walls", [None, "mirror"])
+@pytest.mark.parametrize(("kind", "friction"), [("separate", 0.4), ("slip", 0.4), ("sticky", 0.0)])
+@pytest.mark.parametrize("shape", ["sphere", "cup"])
+def test_solution_and_its_derivative(dim, device, shape, kind, friction, walls):
+    """Velocities, and the derivative of the residual, at nodes that meet one surface or several."""
+    bodies, state, rows = made(dim, device, F64, "free", shape, kind, friction, 1, walls)
+    compared = []
+
+    class Both(reference.InTorch):
+        def _solved(self, blocks, contact):
+            own, expected = Solution._solved(self, blocks, contact), super()._solved(blocks, contact)
+            for found, exact in zip(own, expected, strict=True):
+                torch.testing.assert_close(found, exact, rtol=1e-9, atol=1e-10)
+            compared.append(float((expected[1] - torch.eye(expected[1].shape[1]).to(expected[1])).abs().max()))
+            return expected
+
+    for _ in range(5):
+        bodies.step.on_grid = hook = Both(bodies, rows, 2e-3, None)
+        with torch.no_grad():
+            state = bodies.step(state, 2e-3)
+        rows = hook.rows
+    assert max(compared) > 0.1
 
 
 def test_momentum_of_body_and_nodes(dim, device):
@@ -121,7 +143,7 @@ def test_momentum_of_body_and_nodes(dim, device):
     for most in (0, 20):
         arguments = list(arguments_of(bodies, state, rows))
         arguments[8] = most
-        after, end, report = torch.ops.torch_mpm.free_bodies(*arguments)
+        after, end, report, *_ = torch.ops.torch_mpm.free_bodies(*arguments)
         velocity, mass = arguments[:2]
         lost = (mass[:, None] * (velocity - after)).sum(0)
         fallen = bodies.gravity_like(rows).flatten() * 2e-3
@@ -138,9 +160,7 @@ def test_a_body_around_all_of_the_material(dim, device, kind):
     bodies, state, rows = made(dim, device, F64)
     around = Body(mpm.Sphere((0.0,) * dim, 1.5, kind, friction=0.2), 100.0, 5.0)
     bodies = FreeBodies(bodies.step, [around, bodies.bodies[1]])
-    own, expected = both(bodies, state, rows, n=3)
-    for found, wanted in zip(own[:3], expected[:3], strict=True):
-        torch.testing.assert_close(found, wanted, **OPTIONS[F64])
+    compare(bodies, state, rows, n=3)
 
 
 @torch.no_grad()
@@ -169,7 +189,7 @@ def arguments_of(bodies, state, rows, dt=2e-3):
         bodies.step(state, dt)
     bodies.step.on_grid = None
     blocks, velocity, mass = seen[0]
-    return (velocity.contiguous(), mass, *bodies.given(velocity, rows, None), dt, *blocks.packed, [], [])
+    return (velocity.contiguous(), mass, *bodies.given(velocity, rows, None), dt, True, *blocks.packed, [], [])
 
 
 def test_op(dim, device):

@@ -123,7 +123,7 @@ class Body:
         self.inertia = tuple(
             float(check_number("inertia", one, "positive and finite", lambda v: 0 < v < math.inf)) for one in numbers
         )
-        if joint is not None and not isinstance(joint, Joint):
+        if joint is not None and type(joint) not in (Joint, Hinge, Slider, Driven):
             raise TypeError(f"joint must be a Hinge, a Slider, Driven or None, got {shape_of(joint)}")
         self.joint = joint or Joint()
 

@@ -35,7 +35,7 @@ from ..rollouts.steps import MovingBodies, Steps
 from ..state.state import State, check_state
 from ..step.step import Step
 from . import solution
-from .body import Body, Driven, Hinge, Joint, Slider
+from .body import Body, Driven, Joint
 from .exchange import POSE, VELOCITY, Frames, assign, check_bodies, motion_of
 from .solution import TOLERANCE, Solution
 
@@ -159,12 +159,11 @@ class FreeBodies:
 
     def _in_one_op(self, steps: Steps, state: State, rows: Tensor, wrenches: Tensor | None) -> MovingBodies | None:
         """The bodies of steps that the fused op computes; None where it does not."""
-        given = self.given(state.x, rows, wrenches)
-        if given is None or why_not_fused(self.step, state, steps.n, steps.dt) is not None:
+        if self.differentiates(rows, wrenches) or wants_gradient(steps, state):
             return None
-        if wants_gradient(steps, state):
+        if why_not_fused(self.step, state, steps.n, steps.dt) is not None:
             return None
-        (now, *tensors), *others = given
+        (now, *tensors), *others = self.given(state.x, rows, wrenches)
         return MovingBodies(now, now.new_zeros(len(now), 1 + len(self)), (tensors, tuple(others)))
 
     def _check_joints(self, rows: Tensor) -> None:
@@ -217,32 +216,29 @@ class FreeBodies:
             return rows.new_zeros(dim)
         return found if found.dim() == 1 else found[:, None]
 
-    def tables(self, like: Tensor) -> BodyTables | None:
-        """Tables of the op for nodes of the dtype and device of `like`; None where it does not support the bodies."""
-        if not all(type(body.joint) in (Joint, Hinge, Slider, Driven) for body in self.bodies):
-            return None
+    def differentiates(self, *tensors: Tensor | None) -> bool:
+        """Whether a gradient by one of the tensors, gravity, or a parameter of the obstacles is wanted."""
         values = [value for obstacle in self.obstacles for value in values_without_motion(obstacle)]
-        if is_tracked(*[value for value in values if isinstance(value, Tensor)]):
-            return None
-        joints = [(type(b.joint), *vars(b.joint).values()) for b in self.bodies]
-        of_bodies = [(b.mass, b.inertia, *joint) for b, joint in zip(self.bodies, joints, strict=True)]
+        return is_tracked(*[value for value in (*tensors, self.step.gravity, *values) if isinstance(value, Tensor)])
+
+    def tables(self, like: Tensor) -> BodyTables:
+        """Tables of the ops for nodes of the dtype and device of `like`, which are cached while nothing changes."""
+        values = [value for obstacle in self.obstacles for value in values_without_motion(obstacle)]
+        of_bodies = [(b.mass, b.inertia, *vars(b.joint).values()) for b in self.bodies]
         kinds = [obstacle.kind for obstacle in self.obstacles]
         key = (like.dtype, like.device, like.shape[1], *kinds, *of_bodies, *values)
         scenes, frames = self.step.grid.scenes, self.frames
-        made: BodyTables = self._tables.get(
-            key, lambda: body_tables(self.bodies, frames.owner.tolist(), frames.flat(), like, scenes), like
-        )
+        with torch.no_grad():
+            made: BodyTables = self._tables.get(
+                key, lambda: body_tables(self.bodies, frames.owner.tolist(), frames.flat(), like, scenes), like
+            )
         return made
 
-    def given(self, like: Tensor, rows: Tensor, wrenches: Tensor | None) -> tuple[Any, ...] | None:
-        """The bodies as the ops take them, for particles or nodes of the dtype and device of `like`; None where the
-        bodies are differentiated, or the ops do not support them."""
-        tables, gravity, dim = self.tables(like), self.gravity_like(rows), self.step.grid.dim
+    def given(self, like: Tensor, rows: Tensor, wrenches: Tensor | None) -> tuple[Any, ...]:
+        """The bodies as the ops take them, for particles or nodes of the dtype and device of `like`."""
+        (table, data, constants, parts, lists), gravity = self.tables(like), self.gravity_like(rows)
         force = [] if wrenches is None else [wrenches.double()]
-        if tables is None or is_tracked(rows, gravity, *force):
-            return None
-        table, data, constants, parts, lists = tables
-        tensors = [rows, table, data, constants, parts, gravity.reshape(-1, dim), *force]
+        tensors = [rows, table, data, constants, parts, gravity.reshape(-1, self.step.grid.dim), *force]
         limits = solution.MAX_ITERATIONS, TOLERANCE[like.dtype]
         return ([t.detach().contiguous() for t in tensors], *lists, *limits)
 
@@ -256,16 +252,15 @@ class _Hook:
 
     def __call__(self, blocks: Blocks, velocity: Tensor, mass: Tensor, dt: Any) -> Tensor:
         """Node velocities after contact with the bodies, whose rows at the end of the step are then known."""
-        given = self.of.given(velocity, self.rows, self.wrenches)
-        if given is None or is_tracked(velocity, mass):
+        if self.of.differentiates(velocity, mass, self.rows, self.wrenches):
             solution = Solution(self.of, self.rows, self.dt, self.wrenches)
             after = solution(blocks, velocity, mass, dt)
             self.rows, self.report = solution.rows, solution.report
             return after
-        walls = walls_beside(self.of.step.walls, blocks.grid)
-        after, self.rows, self.report = torch.ops.torch_mpm.free_bodies(
-            velocity, mass, *given, self.dt, *blocks.packed, *walls
-        )
+        given = self.of.given(velocity, self.rows, self.wrenches)
+        place = *blocks.packed, *walls_beside(self.of.step.walls, blocks.grid)
+        op = torch.ops.torch_mpm.free_bodies
+        after, self.rows, self.report, *_ = op(velocity, mass, *given, self.dt, False, *place)
         return after
 
 

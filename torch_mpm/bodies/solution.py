@@ -1,22 +1,20 @@
-"""Steps of free bodies from Python, with gradients by the implicit function theorem.
+"""The solution of a step of free bodies with gradients, by the implicit function theorem.
 
-The op `torch_mpm::free_bodies` computes the same where no gradient is wanted.
+The op `torch_mpm::free_bodies` solves; one further iteration of Newton's method, of ops that have derivatives, has the
+gradient of the solution.
 """
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from ..boundaries.motion import rotation_matrix
-from ..cuda_graphs.capture import is_readable
 from ..geometry.values import filled
 from ..grid.grid import Blocks
-from ..ops.autograd import dispatch, graph_at_once
+from ..ops.autograd import dispatch
 from ..ops.contact import obstacle_arguments, packed_rows, walls_beside
 from ..ops.impulses import with_moment
 from .body import Body, mobility
@@ -26,9 +24,7 @@ if TYPE_CHECKING:
     from .free_bodies import FreeBodies
 
 MAX_ITERATIONS = 20
-"""Iterations of Newton's method, but for steps from Python on CUDA."""
-ITERATIONS_ON_CUDA = 8
-"""Iterations of steps from Python where the host does not read the residual: most steps need 1 to 4."""
+"""Iterations of Newton's method: most steps need 1 to 4."""
 TOLERANCE = {torch.float64: 1e-12, torch.float32: 1e-5}
 """Residual of velocities, relative to those of the bodies and by the impulses, by the dtype of the nodes."""
 
@@ -38,7 +34,7 @@ class Solution:
 
     def __init__(self, bodies: FreeBodies, rows: Tensor, dt: float, wrenches: Tensor | None) -> None:
         self.of, self.dt, self.dim = bodies, dt, bodies.step.grid.dim
-        self.begin = rows
+        self.begin, self.wrenches = rows, wrenches
         self.motion = motion_of(rows, self.dim)
         self.turn = rotation_matrix(self.motion.rotation, self.dim)
         self.mass = torch.stack([b.mass_matrix(self.turn[:, k]) for k, b in enumerate(bodies.bodies)], 1)
@@ -49,95 +45,41 @@ class Solution:
             ],
             1,
         )
-        self.predicted = self._predicted(wrenches)
-        self.rows, self.residual, self.iterations = rows, rows.new_zeros(rows.shape[:2]), 0
+        self.predicted = self._predicted()
+        self.rows, self.report = rows, rows.new_zeros(rows.shape[0], 1 + rows.shape[1])
 
-    @property
-    def report(self) -> Tensor:
-        """Number of iterations, and the residual of each body, [B, 1 + K]."""
-        count = torch.full_like(self.residual[:, :1], float(self.iterations))
-        return torch.cat([count, self.residual], 1)
-
-    def _predicted(self, wrenches: Tensor | None) -> Tensor:
+    def _predicted(self) -> Tensor:
         """Velocities at the end of the step without the material [B, K, n]."""
         velocity = self.begin[..., POSE[self.dim] :]
         force = torch.zeros_like(velocity)
         masses = filled([body.mass for body in self.of.bodies], force)
         force[..., : self.dim] = masses[:, None] * self.of.gravity_like(self.begin)
-        if wrenches is not None:
-            force = force + wrenches.double()
+        if self.wrenches is not None:
+            force = force + self.wrenches.double()
         return velocity + self.dt * self._applied(force)
 
     def __call__(self, blocks: Blocks, velocity: Tensor, mass: Tensor, dt: Any) -> Tensor:
         """Node velocities after contact with the bodies, whose rows at the end of the step are then known."""
-        contact = _BodyContact(self.of, self.motion, blocks, velocity, mass)
+        contact = BodyContact(self.of, self.motion, blocks, velocity, mass)
         with torch.no_grad():
-            U, jacobian = self._solve(contact.detached())
-        if torch.is_grad_enabled():
-            # One more iteration with a graph has the gradient of the solution, by the implicit function theorem.
-            gap = U - self.predicted - self._applied(contact.impulses(U))
-            U = U - _SolvedOnce.apply(jacobian(), gap)
+            U, jacobian = self._solved(blocks, contact)
+        gap = U - self.predicted - self._applied(contact.impulses(U))
+        U = U - _SolvedOnce.apply(jacobian, gap)
         self.rows = self._end(self.predicted + self._applied(contact.impulses(U)))
         return contact.velocity_after(U)
-
-    # -- the equations
 
     def _applied(self, impulses: Tensor) -> Tensor:
         return (self.mobility @ impulses[..., None])[..., 0]
 
-    def _residual(self, contact: _BodyContact, U: Tensor) -> tuple[Tensor, Callable[[], Tensor]]:
-        """Residuals [B, K, n] of velocities U, and a function that computes their derivatives by these
-        [B, K n, K n]."""
-        with torch.enable_grad(), graph_at_once():
-            leaf = U.detach().requires_grad_()
-            p = contact.impulses(leaf)
-
-        def derivative() -> Tensor:
-            with torch.enable_grad():
-                sums = p.sum(0).flatten().unbind()
-            rows = [torch.autograd.grad(total, leaf, retain_graph=True)[0].flatten(1) for total in sums]
-            by_body = torch.stack(rows, 1).unflatten(1, p.shape[1:])
-            applied = (self.mobility.detach() @ by_body).flatten(1, 2)
-            return torch.eye(applied.shape[1], dtype=p.dtype, device=p.device) - applied
-
-        return U - self.predicted - self._applied(p), derivative
-
-    def size_of(self, velocities: Tensor) -> Tensor:
-        """Speeds [B, K] of velocities [B, K, n]; of rotation that at the radius of gyration."""
-        inertia = self.mass.diagonal(dim1=2, dim2=3)[..., self.dim :].mean(2)
-        squared = velocities[..., : self.dim].square().sum(2)
-        spin = velocities[..., self.dim :].square().sum(2)
-        return (squared + spin * inertia / self.mass[..., 0, 0]).sqrt()
-
-    def _solve(self, contact: _BodyContact) -> tuple[Tensor, Callable[[], Tensor]]:
-        """Velocities [B, K, n] at the end of the step, and the derivative of the residual there."""
-        U, dtype = self.predicted.detach(), contact.velocity.dtype
-        residual, derivative = self._residual(contact, U)
-        size = self.size_of(residual)
-        scale = self.size_of(self.predicted) + size + torch.finfo(U.dtype).tiny
-        reads, share = is_readable(U), torch.ones_like(scale[:, 0])
-        for _ in range(MAX_ITERATIONS if reads else ITERATIONS_ON_CUDA):
-            if reads and bool((size <= 0.1 * TOLERANCE[dtype] * scale).all()):
-                break
-            self.iterations += 1
-            jacobian = derivative()
-            # Velocities are rounded to the dtype of the nodes, whose impulses change accordingly.
-            eye = torch.eye(jacobian.shape[1], dtype=U.dtype, device=U.device)
-            rounded = torch.finfo(dtype).eps * (jacobian - eye).norm(dim=(1, 2))
-            scale = torch.maximum(scale, (rounded[:, None] * self.size_of(U)) / TOLERANCE[dtype])
-            step = torch.linalg.solve_ex(jacobian, residual.flatten(1))[0].view_as(U)
-            trial = U - share[:, None, None] * step
-            found, of_trial = self._residual(contact, trial)
-            better = self.size_of(found).norm(dim=1) < size.norm(dim=1)
-            share = torch.where(better, 1.0, 0.5 * share)
-            if reads and bool(better.all()):
-                U, residual, derivative = trial, found, of_trial
-            else:
-                U = torch.where(better[:, None, None], trial, U)
-                residual, derivative = self._residual(contact, U)
-            size = self.size_of(residual)
-        self.residual = size / scale
-        return U, derivative
+    def _solved(self, blocks: Blocks, contact: BodyContact) -> tuple[Tensor, Tensor]:
+        """Velocities [B, K, n] at the end of the step, and the derivative of the residual there [B, K n, K n]."""
+        velocity = contact.velocity.detach()
+        given = self.of.given(velocity, self.begin, self.wrenches)
+        place = *blocks.packed, *walls_beside(self.of.step.walls, blocks.grid)
+        op = torch.ops.torch_mpm.free_bodies
+        *_, self.report, U, slopes = op(velocity, contact.mass.detach(), *given, self.dt, True, *place)
+        applied = (self.mobility.detach() @ slopes.unflatten(1, self.mobility.shape[1:3])).flatten(1, 2)
+        return U, torch.eye(applied.shape[1], dtype=applied.dtype, device=applied.device) - applied
 
     # -- the end of the step
 
@@ -208,7 +150,7 @@ class _FirstDerivative(torch.autograd.Function):
         raise NotImplementedError("free bodies have no second derivatives")
 
 
-class _BodyContact:
+class BodyContact:
     """Contact of the nodes with the obstacles of bodies, whose poses are known, by the velocities of the bodies."""
 
     def __init__(self, bodies: FreeBodies, motion: Motion, blocks: Blocks, velocity: Tensor, mass: Tensor) -> None:
@@ -223,13 +165,6 @@ class _BodyContact:
         table, *self.kinds = obstacle_arguments(bodies.obstacles, self.velocity, grid.scenes)
         self.table = table.expand(grid.scenes, -1, -1)
         self.place = (None, 0.0, *blocks.packed, *walls_beside(bodies.step.walls, grid))
-
-    def detached(self) -> _BodyContact:
-        """The same without gradients."""
-        other = copy.copy(self)
-        for name in ("velocity", "mass", "table", "arm", "centre"):
-            setattr(other, name, getattr(self, name).detach())
-        return other
 
     def velocity_after(self, U: Tensor) -> Tensor:
         """Node velocities [N, D] after contact with bodies of the velocities U [B, K, n]."""

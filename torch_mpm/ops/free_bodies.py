@@ -1,8 +1,8 @@
 """One step of free bodies in contact with the nodes, without gradients: tables of the bodies and fake kernels.
 
     torch.ops.torch_mpm.free_bodies(velocity, mass, bodies, body_shape, body_sizes, body_contact, body_owner,
-        body_joint, max_iterations, tolerance, dt, topology, lattice, layout, wall_kind=[], wall_plane=[])
-        -> (velocity, rows, report)
+        body_joint, max_iterations, tolerance, dt, wants_solution, topology, lattice, layout, wall_kind=[],
+        wall_plane=[]) -> (velocity, rows, report, motion, slopes)
 
 `bodies` are tensors: rows [B, K, 13] or [B, K, 6] of the bodies at the beginning of the step (torch_mpm.bodies), the
 table of their obstacles [1 or B, O, width] and the data of the shapes as in `contact`, of which friction and shape are
@@ -12,7 +12,8 @@ the joint [D]; poses of the obstacles in the frames of their bodies [O, D + 1 or
 float64. `body_owner` are the bodies of the obstacles, `body_joint` the numbers of `JOINTS`.
 
 The results are the velocities of the nodes after contact, the rows at the end of the step, and the report [B, 1 + K]:
-the number of iterations, and the residual of each body relative to its velocities.
+the number of iterations, and the residual of each body relative to its velocities. If `wants_solution`, also the
+velocities U [B, K, n] that solve the equations, and the derivatives [B, K n, K n] of the impulses by these; else None.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from ..geometry.values import filled
 from .arguments import refuse_vmap, sizes
 from .autograd import register_autograd
 from .grid_update import CONTACT_KINDS
+from .impulses import impulse_size
 from .obstacle_tables import tables_without_motion
 
 if TYPE_CHECKING:
@@ -80,9 +82,16 @@ def _joint_numbers(body: Body, name: str, dim: int) -> tuple[float, ...]:
 
 
 @torch.library.register_fake("torch_mpm::free_bodies")
-def _fake(velocity, mass, bodies, *arguments):
+def _fake(
+    velocity, mass, bodies, shape, form_sizes, contact, owner, joint, most, tolerance, dt, wants_solution, *others
+):
     N, D = sizes(velocity, "velocity", 2)
-    return velocity.new_empty(N, D), *fake_bodies(bodies)
+    rows, report = fake_bodies(bodies)
+    if not wants_solution:
+        return velocity.new_empty(N, D), rows, report, None, None
+    scenes, count, n = rows.shape[0], rows.shape[1], impulse_size(D)
+    solution = rows.new_empty(scenes, count, n), rows.new_empty(scenes, count * n, count * n)
+    return velocity.new_empty(N, D), rows, report, *solution
 
 
 def fake_bodies(bodies: list[Tensor]) -> tuple[Tensor, Tensor]:
@@ -93,8 +102,7 @@ def fake_bodies(bodies: list[Tensor]) -> tuple[Tensor, Tensor]:
 
 def _no_derivative(ctx: Any, *grads: Any) -> None:
     raise NotImplementedError(
-        "torch_mpm::free_bodies has no derivative: torch_mpm.bodies.FreeBodies computes steps whose gradient is wanted "
-        "by other ops"
+        "torch_mpm::free_bodies has no derivative: torch_mpm.bodies.FreeBodies differentiates its solution"
     )
 
 
