@@ -120,7 +120,7 @@ class SceneBodies {
   ObstacleRow<T, D>* const rows;  // [obstacles]
 
   // Reads the bodies, and places their obstacles.
-  MPM_HD void begin() {
+  MPM_HD void begin() const {
     team_.each(a.bodies, [&](int k) {
       const double* const gravity = a.gravity + (a.gravity_rows == 1 ? 0 : int64_t(scene_) * D);
       now[k] = body_now(a.constants[k], a.joint[k], a.begin + body(k) * kBodyRow<D>, gravity,
@@ -132,7 +132,6 @@ class SceneBodies {
     team_.each(a.contact.obstacles, [&](int o) {
       rows[o] = given[o];
       place_part(now[a.owner[o]], a.parts[o], rows[o]);
-      move_part(now[a.owner[o]], a.parts[o], s_.U + a.owner[o] * n, rows[o]);
     });
     team_.sync();
   }

@@ -243,7 +243,7 @@ MPM_HD double size_of_motion(const BodyNow<D>& b, const double* motion) {
 
 // ---- the obstacles of a body
 
-// Sets the pose of an obstacle of a body.
+// Sets the pose of an obstacle of a body, at rest.
 template <class T, int D>
 MPM_HD void place_part(const BodyNow<D>& b, const PartPose<D>& part, ObstacleRow<T, D>& row) {
   Vector<double, D> arm;
@@ -255,9 +255,9 @@ MPM_HD void place_part(const BodyNow<D>& b, const PartPose<D>& part, ObstacleRow
   arm = b.turn * arm;
   own = composed(b.rotation, own);
   MPM_UNROLL for (int i = 0; i < D; i++)
-    row.position[i] = T(b.position[i] + arm[i]);
+    row.position[i] = T(b.position[i] + arm[i]), row.velocity[i] = T(0);
   MPM_UNROLL for (int i = 0; i < kTurns<D>; i++)
-    row.rotation[i] = T(own[i]);
+    row.rotation[i] = T(own[i]), row.angular_velocity[i] = T(0);
 }
 
 // Sets the velocities of an obstacle of a body with a motion.
