@@ -567,19 +567,26 @@ struct TakenVelocities {
   Vector<T, D> taken[Constraints<T, D>::most];
 };
 
+// Of a node at a wall or a mirror with the given signs.
+template <class T, int D>
+MPM_HD void take_velocities(const Constraints<T, D>& c, const Vector<T, D>& sign, const Vector<T, D>& v,
+                            TakenVelocities<T, D>& result) {
+  Vector<T, D> change[Constraints<T, D>::most];
+  changes_of_constraints<T, D>(c, reflected(sign, v), change);
+  result.count = c.count;
+  for (int i = 0; i < c.count; i++) {
+    result.obstacle[i] = c.e[i].owner < 0 ? c.e[0].owner : c.e[i].owner;
+    result.taken[i] = T(-1) * reflected(sign, change[i]);
+  }
+}
+
 template <class T, int D>
 MPM_HD_CALL void find_taken(bool wanted, const SlotPoses<T, D>& poses, const NodeContact<T, D>& contact,
                             const Vector<T, D>& v, TakenVelocities<T, D>& result) {
   if (!wanted) return;
   Constraints<T, D> c;
   find_constraints(poses, contact, c);
-  Vector<T, D> change[Constraints<T, D>::most];
-  changes_of_constraints<T, D>(c, reflected(contact.sign, v), change);
-  result.count = c.count;
-  for (int i = 0; i < c.count; i++) {
-    result.obstacle[i] = c.e[i].owner < 0 ? c.e[0].owner : c.e[i].owner;
-    result.taken[i] = T(-1) * reflected(contact.sign, change[i]);
-  }
+  take_velocities(c, contact.sign, v, result);
 }
 
 // ---- adjoints

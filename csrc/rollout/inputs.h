@@ -9,6 +9,8 @@
 // The arguments of a call of many steps, its particles and its laws.
 namespace mpm {
 
+struct BodiesOfCall;  // see bodies/bodies.op.h
+
 // The arguments of a call: a kind, the name in the schema, and the member of SubstepsInputs. The only list of them.
 #define MPM_SUBSTEPS_LIST(FIRST, X)             \
   FIRST(TENSOR, x, x)                           \
@@ -115,6 +117,7 @@ struct SubstepsInputs {
     return share;
   }
   PackedLattice lattice{lattice_numbers, lattice_layout};
+  BodiesOfCall* bodies = nullptr;  // free bodies, or null
 };
 
 // The parts of a list between commas or other marks.

@@ -41,7 +41,8 @@ namespace mpm {
   BOOL(graph_loops)        /* the device runs CUDA graphs with loops: CUDA 13, and no MPS */ \
   INT(path_bytes)          /* of the table of obstacles on paths, of one substep */          \
   INT(obstacles)                                                                             \
-  BOOL(heat) /* is conducted */
+  BOOL(heat)   /* is conducted */                                                            \
+  BOOL(bodies) /* free ones that the material pushes */
 
 struct PlanFacts {
 #define MPM_INT(name) int64_t name = 0;
@@ -161,6 +162,7 @@ inline std::string why_not_many_phases(const PlanFacts& f) {
   if (f.mirrors) return "mirrors read nodes of other blocks";
   if (f.impulses) return "impulses are accumulated";
   if (f.heat) return "heat is conducted";
+  if (f.bodies) return "bodies move with the material";
   return {};
 }
 
@@ -184,6 +186,7 @@ inline std::string unsupported(const PlanFacts& f) {
   if (f.mirrors) return "mirrors read nodes of other blocks";
   if (f.impulses) return "impulses are accumulated";
   if (f.heat) return "heat is conducted";
+  if (f.bodies) return "bodies move with the material";
   if (f.gradients) return "gradients are wanted";
   if (f.particles == 0) return "there are no particles";
   if (f.steps < kLeastSceneSteps) return "a call has fewer than " + count(kLeastSceneSteps, "steps");

@@ -2,9 +2,11 @@
 
 #include <cmath>
 #include <memory>
+#include <optional>
 #include <string>
 #include <type_traits>
 
+#include "bodies/bodies.op.h"
 #include "grid/contact.h"
 #include "grid/impulse.op.h"
 #include "grid/obstacle.op.h"
@@ -46,6 +48,7 @@ struct Substeps {
   NextGridArguments<T, D> next;                         // with `update` and `contact` of this struct
   Tensor known_nodes = absent(), known = absent();      // see ContactArguments
   std::shared_ptr<void> known_slots;                    // on the CPU, see contact.cpu.cpp
+  std::optional<BodiesCall<T, D>> bodies;               // free bodies, which move after the obstacles act
   Tensor impulse = absent(), impulse_slots = absent();  // on obstacles and walls, if wanted; see `add_impulses_to`
   bool obstacles = false, fused = false;
   bool laws_are_apart = false;  // whether laws have kernels of their own: they read temperatures, or heat the particles
@@ -320,9 +323,18 @@ struct Substeps {
   void move_nodes(backend::Stream stream) {
     if (impulse.defined() && !in.wall_kind.empty()) backend::wall_impulses(wall_impulses(), stream);
     update_grid(stream);
-    if (!obstacles || next.obstacles) return;
-    if (impulse.defined()) backend::contact_impulses(contact_impulses(), stream);
-    backend::contact(contact, stream);
+    if (obstacles && !next.obstacles) {
+      if (impulse.defined()) backend::contact_impulses(contact_impulses(), stream);
+      backend::contact(contact, stream);
+    }
+    if (bodies) move_bodies(stream);
+  }
+
+  // Free bodies: their step, and the velocities of the nodes after contact with them, in place.
+  void move_bodies(backend::Stream stream) {
+    T* const rows = static_cast<T*>((pool.velocity.defined() ? pool.velocity : pool.updated).data_ptr());
+    bodies->run(update.block, activation.max_blocks, update.max_blocks, static_cast<const T*>(pool.updated.data_ptr()),
+                1 + D, rows + 1, 1 + D, stream);
   }
 
   // Grid update; on CUDA with contact, if an activation serves several substeps.
@@ -368,6 +380,7 @@ struct Substeps {
   void set_grid_update();
   void set_obstacles();
   void set_clocks();
+  void set_bodies();
   PlanFacts facts_of_call() const;
 };
 
@@ -384,6 +397,7 @@ Substeps<T, D>::Substeps(const SubstepsInputs& inputs) : in(inputs) {
   set_grid_update();
   set_obstacles();
   set_clocks();
+  set_bodies();
   if (has(in.impulse)) {
     check_shape(*in.impulse, "impulse", impulse_shape());
     check_type(*in.impulse, "impulse", ScalarType::Double, in.x);
@@ -471,6 +485,18 @@ void Substeps<T, D>::set_clocks() {
   update.scene_dt = p2g.scene_dt.pointer;
 }
 
+template <class T, int D>
+void Substeps<T, D>::set_bodies() {
+  if (!in.bodies) return;
+  STD_TORCH_CHECK(in.resident && !in.records,
+                  "bodies are computed without gradients: records must be false, and "
+                  "resident true");
+  bodies.emplace(in.bodies->in, in.x, in.lattice, in.wall_kind, in.wall_plane, in.scenes, in.dt);
+  if (update.scene_dt) bodies->set_scene_dt(update.scene_dt);
+  in.bodies->rows = bodies->rows();
+  in.bodies->report = bodies->report();
+}
+
 // The facts of a call, except those of the stream and the device.
 template <class T, int D>
 PlanFacts Substeps<T, D>::facts_of_call() const {
@@ -504,6 +530,7 @@ PlanFacts Substeps<T, D>::facts_of_call() const {
   f.records = in.records;
   f.obstacles = contact.obstacles;
   f.heat = !in.heat.empty();
+  f.bodies = in.bodies != nullptr;
   return f;
 }
 

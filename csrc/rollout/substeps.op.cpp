@@ -144,6 +144,17 @@ Results run(const SubstepsInputs& in) {
 
 Results substeps(MPM_SUBSTEPS_PARAMETERS) { return run(SubstepsInputs{MPM_SUBSTEPS_ARGUMENTS}); }
 
+// The same with free bodies; the last two results are their rows and their report, see csrc/bodies/bodies.op.h.
+using BodiesResults = decltype(std::tuple_cat(Results(), std::tuple<Tensor, Tensor>()));
+
+BodiesResults substeps_with_bodies(MPM_BODIES_PARAMETERS, MPM_SUBSTEPS_PARAMETERS) {
+  BodiesOfCall given{{bodies, body_shape, body_sizes, body_contact, body_owner, body_joint, max_iterations, tolerance}};
+  SubstepsInputs in{MPM_SUBSTEPS_ARGUMENTS};
+  in.bodies = &given;
+  Results results = run(in);
+  return std::tuple_cat(std::move(results), std::tuple(given.rows, given.report));
+}
+
 // Schedule of the latest call of this thread on the device of a tensor.
 int64_t latest_schedule(const Tensor&) { return schedule_of_latest; }
 
@@ -151,16 +162,20 @@ int64_t latest_schedule(const Tensor&) { return schedule_of_latest; }
 }  // namespace mpm
 
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
+#define MPM_SUBSTEPS_RESULTS                                                                                       \
+  "Tensor x, Tensor v, Tensor C, Tensor F, Tensor J, Tensor history, Tensor status, Tensor impulse, Tensor time, " \
+  "Tensor residual, Tensor heat, Tensor heat_status, Tensor record"
 STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
-  m.def("substeps(" MPM_SUBSTEPS_SCHEMA
-        ") -> (Tensor x, Tensor v, Tensor C, Tensor F, Tensor J, Tensor history, Tensor status, Tensor "
-        "impulse, Tensor time, Tensor residual, Tensor heat, Tensor heat_status, Tensor record)");
+  m.def("substeps(" MPM_SUBSTEPS_SCHEMA ") -> (" MPM_SUBSTEPS_RESULTS ")");
+  m.def("substeps_with_bodies(" MPM_BODIES_SCHEMA ", " MPM_SUBSTEPS_SCHEMA ") -> (" MPM_SUBSTEPS_RESULTS
+        ", Tensor rows, Tensor report)");
   m.def("latest_schedule(Tensor like) -> int");
 }
 #endif
 
 MPM_LIBRARY_IMPL(m) {
   m.impl("substeps", TORCH_BOX(&mpm::substeps));
+  m.impl("substeps_with_bodies", TORCH_BOX(&mpm::substeps_with_bodies));
   m.impl("latest_schedule", TORCH_BOX(&mpm::latest_schedule));
 }
 

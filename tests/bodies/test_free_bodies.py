@@ -101,7 +101,7 @@ def test_a_body_without_contact_flies_freely(device):
     rows = rows_of(3, (0.2, 1.8, 0.2), (0.1, 0.0, 0.0), (1.0, 2.0, 0.5), device=device)
     with torch.no_grad():
         _, end = bodies.advance(state, rows, 40, 5e-3)
-    turn = mpm.bodies.free_bodies.rotation_matrix(mpm.bodies.exchange.motion_of(end, 3).rotation, 3)
+    turn = mpm.bodies.solution.rotation_matrix(mpm.bodies.exchange.motion_of(end, 3).rotation, 3)
     momentum = (body.mass_matrix(turn[:, 0])[0, 3:, 3:] @ end[0, 0, 10:]).cpu()
     torch.testing.assert_close(momentum, torch.tensor([1.0, 4.0, 1.5], dtype=F64), rtol=1e-12, atol=0)
     assert float((end[0, 0, 10:] - rows[0, 0, 10:]).norm()) > 0.1
@@ -261,7 +261,7 @@ def test_wrenches_act_as_gravity_does(device):
 
 
 def test_a_solve_that_has_not_converged_is_reported(monkeypatch):
-    monkeypatch.setattr(mpm.bodies.free_bodies, "MAX_ITERATIONS", 0)
+    monkeypatch.setattr(mpm.bodies.solution, "MAX_ITERATIONS", 0)
     step, state = material(2)
     bodies = FreeBodies(step, [ball_of(2, 0.1)])
     with torch.no_grad():
@@ -271,7 +271,7 @@ def test_a_solve_that_has_not_converged_is_reported(monkeypatch):
 
 
 def test_what_has_no_derivative_is_an_error():
-    """Second derivatives, torch.func and inference mode; the bodies hold no graph after a step."""
+    """Second derivatives and torch.func; the bodies hold no graph after a step, and inference mode needs none."""
     step, state = material(2)
     bodies = FreeBodies(step, [ball_of(2)])
     rows = rows_of(2, (1.05, 1.19), (0.2, -1.0)).requires_grad_()
@@ -280,8 +280,9 @@ def test_what_has_no_derivative_is_an_error():
     (first,) = torch.autograd.grad(end.square().sum(), rows, create_graph=True)
     with pytest.raises(NotImplementedError, match="second derivatives"):
         torch.autograd.grad(first.sum(), rows)
-    with torch.inference_mode(), pytest.raises(NotImplementedError, match="inference_mode"):
-        bodies.advance(state, rows.detach(), 1, 1e-3)
+    with torch.inference_mode():
+        inferred = bodies.advance(state, rows.detach(), 2, 2e-3)[1]
+    torch.testing.assert_close(inferred.clone(), end.detach(), rtol=1e-10, atol=1e-12)
     with pytest.raises(NotImplementedError, match=r"torch\.func"):
         torch.func.grad(lambda r: bodies.advance(state, r, 1, 1e-3)[1].sum())(rows.detach())
 
@@ -341,6 +342,7 @@ def test_gradients_equal_differences(device, joint):
         (lambda step: FreeBodies(step, [Body(mpm.Sphere((0, 0), 0.1, end=1.0), 1.0, 1.0)]), "at all times"),
         (lambda step: FreeBodies(step, [Body(mpm.SDF(lambda x: x[:, 0], (0, 0)), 1.0, 1.0)]), "Sampled.of"),
         (lambda step: Slider((0.0, 0.0)), "positive length"),
+        (lambda step: Body(mpm.Sphere((0, 0), 0.1), 1.0, 1.0, joint=OwnJoint((1.0, 0.0))), "joint must be a Hinge"),
         (lambda step: FreeBodies(step, [Body(_hooked(), 1.0, 1.0)]), "no hooks"),
     ],
 )
@@ -348,6 +350,10 @@ def test_wrong_arguments(make, error):
     step, _ = material(2)
     with pytest.raises((TypeError, ValueError), match=error):
         make(step)
+
+
+class OwnJoint(Slider):
+    """A joint that the kernels do not know."""
 
 
 def _hooked():

@@ -43,6 +43,7 @@ CUDA = Facts(
     path_bytes=0,
     obstacles=0,
     heat=False,
+    bodies=False,
 )
 CPU = CUDA._replace(cuda=False, graph_loops=False)
 FEW = CUDA._replace(particles=5000, blocks_per_scene=1000, max_blocks=100)
@@ -69,6 +70,10 @@ DECISIONS = [
     (CUDA, {"grows": False, "path_bytes": 2**20}, "per_step", None, 64),
     # Few particles.
     (FEW, {}, "persistent", 1000, 1000),
+    (FEW, {"bodies": True}, "per_step", None, 64),
+    (MANY, {"bodies": True}, "per_step", 32768, 512),
+    (BATCH, {"bodies": True}, "per_step", None, 64),
+    (CPU, {"bodies": True}, "sorted_cpu", None, 1000),
     (FEW, {"steps": 2000}, "persistent", 1000, 1024),
     (FEW, {"steps": 10}, "persistent", 1000, 10),
     (FEW, {"steps": 9}, "per_step", None, 9),

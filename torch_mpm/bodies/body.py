@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -13,9 +14,15 @@ from ..errors import check_number, check_vector, shape_of
 from ..geometry.values import filled
 from .exchange import VELOCITY, Part, parts_of, swirl
 
+NOT_ALLOWED = 1e-5
+"""Largest share of a velocity that a joint does not allow."""
+
 
 class Joint:
     """Motion that a body is free to have. This one allows all of it."""
+
+    name: ClassVar = "free"
+    """The joint among `torch_mpm.ops.free_bodies.JOINTS`."""
 
     def directions(self, position: Tensor) -> Tensor | None:
         """Velocities and angular velocities [B, n, f] that the body at a position [B, D] may have; None for all."""
@@ -36,6 +43,8 @@ class Hinge(Joint):
         anchor: a point of the axis [m], D numbers.
         axis: its direction, 3 numbers of any length but zero; None in 2-D.
     """
+
+    name: ClassVar = "hinge"
 
     def __init__(self, anchor: Sequence[float], axis: Sequence[float] | None = None) -> None:
         self.anchor = check_vector("anchor", anchor)
@@ -62,6 +71,8 @@ class Slider(Joint):
         axis: the direction, D numbers of any length but zero.
     """
 
+    name: ClassVar = "slider"
+
     def __init__(self, axis: Sequence[float]) -> None:
         self.axis = _unit("axis", axis)
 
@@ -77,6 +88,8 @@ class Slider(Joint):
 
 class Driven(Joint):
     """No motion but the velocity that the body is given: nothing pushes it."""
+
+    name: ClassVar = "driven"
 
     def directions(self, position: Tensor) -> Tensor | None:
         return position.new_zeros(len(position), VELOCITY[position.shape[1]], 0)
@@ -110,7 +123,7 @@ class Body:
         self.inertia = tuple(
             float(check_number("inertia", one, "positive and finite", lambda v: 0 < v < math.inf)) for one in numbers
         )
-        if joint is not None and not isinstance(joint, Joint):
+        if joint is not None and type(joint) not in (Joint, Hinge, Slider, Driven):
             raise TypeError(f"joint must be a Hinge, a Slider, Driven or None, got {shape_of(joint)}")
         self.joint = joint or Joint()
 
@@ -123,6 +136,22 @@ class Body:
         self.joint.check_dimension(dim)
         for part in self.parts:
             part.check_dimension(dim)
+
+    def moves_as_its_joint(self, position: Tensor, velocity: Tensor) -> bool:
+        """Whether the joint allows velocities [B, n] at positions [B, D], up to a share of `NOT_ALLOWED`; reads them.
+
+        The projection on what it allows is by a frame that is not turned: a velocity that is allowed is its own
+        projection for any inertia.
+        """
+        directions = self.joint.directions(position)
+        if directions is None:
+            return True
+        count, dim = position.shape
+        matrix = self.mass_matrix(torch.eye(dim, dtype=position.dtype).expand(count, -1, -1))
+        allowed = (mobility(matrix, directions) @ matrix @ velocity[..., None])[..., 0]
+        weights = matrix.diagonal(dim1=1, dim2=2)
+        wrong, whole = ((v.square() * weights).sum(1) for v in (velocity - allowed, velocity))
+        return not bool((wrong > NOT_ALLOWED**2 * whole).any())
 
     def mass_matrix(self, turn: Tensor) -> Tensor:
         """Mass and inertia [B, n, n] by the rotation of the frame [B, D, D], n = 3 in 2-D and 6 in 3-D."""

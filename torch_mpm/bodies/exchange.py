@@ -325,6 +325,10 @@ class Frames(NamedTuple):
         turn = torch.tensor([zero if part.rotation is None else part.rotation for part in flat], dtype=torch.float64)
         return Frames(owner, position.reshape(-1, dim), turn.reshape(-1, *(3,) * (dim - 2)))
 
+    def flat(self) -> Tensor:
+        """Positions and rotations side by side [O, D + 1 or 3]."""
+        return torch.cat([self.position, self.rotation.reshape(len(self.owner), -1)], 1)
+
     def to(self, device: torch.device) -> Frames:
         """The same on a device."""
         return Frames(*(values.to(device, non_blocking=True) for values in self))

@@ -27,6 +27,15 @@ def tables(obstacles: Sequence[Obstacle], like: Tensor, scenes: int) -> tuple[Te
     return kept
 
 
+def tables_without_motion(obstacles: Sequence[Obstacle], like: Tensor, scenes: int) -> tuple[Tensor, Tensor]:
+    """`tables` whose columns of poses and velocities are zero, for ops that compute these; not cached."""
+    _check_scenes(obstacles, like, scenes)
+    rows = [_joined(_parts(o, like, moves=False)) for o in obstacles]
+    count = _count([row.shape[0] for row in rows], scenes)
+    table = torch.stack([row.expand(count, -1) for row in rows], 1).contiguous()
+    return table, torch.cat([o.shape.data(like) for o in obstacles])
+
+
 def tables_over(obstacles: Sequence[Obstacle], like: Tensor, scenes: int, times: StepTimes) -> tuple[Tensor, Tensor]:
     """Parameters at many times, with the positions at each, [n, 1 or B, K, width]; and data as in `tables`."""
     _check_scenes(obstacles, like, scenes)
@@ -38,9 +47,17 @@ def tables_over(obstacles: Sequence[Obstacle], like: Tensor, scenes: int, times:
 
 def _values(obstacle: Obstacle) -> tuple[Any, ...]:
     """An obstacle, its shape, and the numbers and tensors of both that enter the tables."""
-    moved, shape = obstacle.motion, obstacle.shape
-    motion = (obstacle.friction, moved.position, moved.velocity, moved.rotation, moved.angular_velocity)
-    return (obstacle, shape, *motion, *[getattr(shape, name) for name in shape.arguments])
+    moved = obstacle.motion
+    return (
+        *values_without_motion(obstacle),
+        *(moved.position, moved.velocity, moved.rotation, moved.angular_velocity),
+    )
+
+
+def values_without_motion(obstacle: Obstacle) -> tuple[Any, ...]:
+    """An obstacle, its shape, and the numbers and tensors of both that enter `tables_without_motion`."""
+    shape = obstacle.shape
+    return (obstacle, shape, obstacle.friction, *[getattr(shape, name) for name in shape.arguments])
 
 
 def _build(obstacles: Sequence[Obstacle], like: Tensor, scenes: int) -> tuple[Tensor, Tensor]:
@@ -64,13 +81,14 @@ def _count(counts: Sequence[int], scenes: int) -> int:
     return count
 
 
-def _parts(obstacle: Obstacle, like: Tensor) -> dict[str, Tensor]:
-    """Columns of its row by name, [1 or B, n] each; zero where it has none, or where a path gives its position."""
+def _parts(obstacle: Obstacle, like: Tensor, moves: bool = True) -> dict[str, Tensor]:
+    """Columns of its row by name, [1 or B, n] each; zero where it has none, or where a path gives its position, and
+    those of its motion unless it moves."""
     vector, shape = (like.shape[1],), obstacle.shape
     turn = () if like.shape[1] == 2 else (3,)
     motion = {"position": vector, "velocity": vector, "rotation": turn, "angular_velocity": turn}
     absent = {"position"} if obstacle.follows_path else set()
-    absent |= {name for name in motion if getattr(obstacle.motion, name) is None}
+    absent |= {name for name in motion if not moves or getattr(obstacle.motion, name) is None}
     parts = {"friction": _part(obstacle, "friction", like, ())}
     for name, size in motion.items():
         parts[name] = _part(obstacle.motion, None if name in absent else name, like, size)

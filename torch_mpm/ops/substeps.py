@@ -44,6 +44,12 @@ Where temperatures change, a name in `laws` may be that of a solid and, after a 
 `thermal` are records of three numbers: a law, one of its parameters or -1 for the linear expansion of its material or
 -2 for the coherency of a liquid, and one of the `tables` [2, K], increasing temperatures and values; K = 1 is a number.
 
+    torch.ops.torch_mpm.substeps_with_bodies(bodies, body_shape, body_sizes, body_contact, body_owner, body_joint,
+        max_iterations, tolerance, *arguments of substeps) -> (*results of substeps, rows, report)
+
+are the steps with free bodies as `torch_mpm::free_bodies` takes them, which act in each step after the obstacles: their
+rows at the end, and the report with the most iterations and the largest residuals of a step. It has no adjoint.
+
 `schedule` is the number of a schedule in the order of csrc/rollout/plan.h; -1 chooses the fastest. A schedule that does
 not support the call is an error with the reason; its sums may round differently.
 
@@ -91,6 +97,7 @@ from torch import Tensor
 from ..signals import interruptible
 from .arguments import refuse_vmap, sizes, soa_empty, sum_by_scene
 from .autograd import dispatch, register_autograd
+from .free_bodies import fake_bodies
 from .law import _entries, _of_history, _of_parameters
 
 MASS, VOLUME, PARAMETERS, GRAVITY, OBSTACLES, TIME_STEP, HEAT_PARAMETERS, HEAT_BOUNDARIES = (1 << k for k in range(8))
@@ -140,6 +147,11 @@ def _fake(
         None if not given["heat"] else x.new_empty((scenes, 3), dtype=torch.float64),
         _fake_record(x) if given["records"] and impulse is None else None,
     )
+
+
+@torch.library.register_fake("torch_mpm::substeps_with_bodies")
+def _bodies_fake(bodies, *arguments):
+    return (*_fake(*arguments[7:]), *fake_bodies(bodies))
 
 
 def _columns_of_heat(given: dict[str, Any], dim: int) -> int:
@@ -280,7 +292,13 @@ def _no_second_derivatives(ctx: Any, *grads: Any) -> None:
     )
 
 
+def _no_derivatives(ctx: Any, *grads: Any) -> None:
+    raise NotImplementedError("steps with free bodies in one op have no derivative: torch_mpm.bodies.FreeBodies does")
+
+
 register_autograd("substeps", _backward, _setup)
+register_autograd("substeps_with_bodies", _no_derivatives)
 register_autograd("substeps_backward", _no_second_derivatives)
 refuse_vmap("substeps")
 refuse_vmap("substeps_backward")
+refuse_vmap("substeps_with_bodies")

@@ -61,6 +61,7 @@ class Facts(NamedTuple):
     path_bytes: int
     obstacles: int
     heat: bool
+    bodies: bool
 
 
 def facts_of(steps: Steps, state: State, stores_all: bool = False) -> Facts:
@@ -106,6 +107,7 @@ def facts_of(steps: Steps, state: State, stores_all: bool = False) -> Facts:
         path_bytes,
         len(_obstacles(step)),
         step.heat is not None,
+        steps.bodies is not None,
     )
 
 

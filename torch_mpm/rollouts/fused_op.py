@@ -28,7 +28,7 @@ from .fused_heat import heat_arguments, heat_changes
 from .plan import SCHEDULES, RolloutPlan
 from .reasons import why_not_fused
 from .sorting import STEPS_IN_ORDER, restore_order, sort_particles
-from .steps import Steps
+from .steps import MovingBodies, Steps
 
 
 def in_calls(steps: Steps, state: State, plan: RolloutPlan) -> State:
@@ -45,7 +45,7 @@ def in_calls(steps: Steps, state: State, plan: RolloutPlan) -> State:
         while count > 0:
             call = plan.call(count, step.grid.max_blocks)
             steps_now = min(count, plan.steps_per_call) if with_gradient else call.steps
-            state = substeps(step, state, steps_now, dt, plan.stores_all, call.max_blocks, schedule)
+            state = substeps(step, state, steps_now, dt, plan.stores_all, call.max_blocks, schedule, steps.bodies)
             count -= steps_now
         return state
 
@@ -78,8 +78,9 @@ def substeps(
     records: bool = False,
     blocks: int | None = None,
     schedule: str | None = None,
+    bodies: MovingBodies | None = None,
 ) -> State:
-    """The state n steps later, by one call of the op; `why_not_fused` must be None.
+    """The state n steps later, by one call of the op, which also moves the bodies; `why_not_fused` must be None.
 
     With `records` the inputs of the adjoint are stored; otherwise the backward pass recomputes the steps. The pool has
     room for at least `blocks` blocks; None for as many as the grid has.
@@ -90,7 +91,7 @@ def substeps(
     """
 
     def advanced(state: State, dt: float | Tensor) -> State:
-        return _substeps(step, state, n, dt, records, blocks, schedule)
+        return _substeps(step, state, n, dt, records, blocks, schedule, bodies)
 
     return paused(advanced, step._error_status, step.prepare(state), dt, step.grid.scenes, n)
 
@@ -166,15 +167,28 @@ def _arguments(
 
 
 def _substeps(
-    step: Step, state: State, n: int, dt: float | Tensor, records: bool, blocks: int | None, schedule: str | None
+    step: Step,
+    state: State,
+    n: int,
+    dt: float | Tensor,
+    records: bool,
+    blocks: int | None,
+    schedule: str | None,
+    bodies: MovingBodies | None,
 ) -> State:
     """`substeps` of a prepared state, where no scene is paused."""
     grid, errors = step.grid, step._error_status
     errors.begin(state, grid.scenes)
     arguments, history_names = _arguments(step, state, n, dt, records, blocks, schedule)
-    x, v, C, F, J, history, status, impulse, time, residual, heat, heat_status, _ = interruptible(
-        dispatch, torch.ops.torch_mpm.substeps, *arguments
-    )
+    op = torch.ops.torch_mpm.substeps
+    if bodies is not None:
+        op = torch.ops.torch_mpm.substeps_with_bodies
+        tensors, others = bodies.arguments
+        arguments = ([bodies.rows, *tensors], *others, *arguments)
+    results = interruptible(dispatch, op, *arguments)
+    x, v, C, F, J, history, status, impulse, time, residual, heat, heat_status, _, *of_bodies = results
+    if bodies is not None:
+        bodies.follow(*of_bodies)
     errors.follow(errors.status, status)
     grid.watch(status)
     if status.is_cpu:  # The op has enlarged the pool, or stopped.

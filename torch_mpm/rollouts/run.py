@@ -109,7 +109,7 @@ def rollout(
     check_state(state)
     if truncate is None and hook is None and norms is None and prefix == 0 and every == 1 and every is not True:
         with steps.call(state) as end_call, steps.control(state) as end_motion:
-            return end_call(end_motion(_computed(steps, state, plan)))
+            return end_call(end_motion(computed(steps, state, plan)))
     with steps.call(state) as end_call:
         return end_call(_in_parts(steps, state, Parts(n, prefix, truncate, hook, every, norms), plan))
 
@@ -127,7 +127,7 @@ def _in_parts(steps: Steps, state: State, parts: Parts, plan: RolloutPlan | None
         steps = steps._replace(checkpoints=within_budget(with_gradient, state, fused))
 
     def advance(state: State, count: int, k: int) -> State:
-        return _computed(steps.part(count, k), state, plan)
+        return computed(steps.part(count, k), state, plan)
 
     return parts.run(advance, state, scales, lambda state, count: steps.part(count).control(state))
 
@@ -139,7 +139,7 @@ def _as_planned(steps: Steps, plan: RolloutPlan) -> Steps:
     return steps._replace(checkpoints=plan.checkpoints, graph=graph, schedule=schedule)
 
 
-def _computed(steps: Steps, state: State, given: RolloutPlan | None = None) -> State:
+def computed(steps: Steps, state: State, given: RolloutPlan | None = None) -> State:
     """The state after the steps, by their plan.
 
     Raises:

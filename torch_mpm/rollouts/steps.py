@@ -3,15 +3,36 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import torch
 from torch import Tensor
 
 from ..boundaries.control import Leave, control_step
 from ..state.state import State
 from ..step.step import Step
 from .checkpoints import Checkpoints
+
+
+@dataclasses.dataclass
+class MovingBodies:
+    """Free bodies of steps in the fused op, which changes their rows.
+
+    Attributes:
+        rows: poses and velocities [B, K, 13] or [B, K, 6] now.
+        report: the most iterations and the largest residuals so far [B, 1 + K].
+        arguments: those of `torch.ops.torch_mpm.substeps_with_bodies` after the rows, the other tensors first.
+    """
+
+    rows: Tensor
+    report: Tensor
+    arguments: tuple[list[Tensor], tuple[Any, ...]]
+
+    def follow(self, rows: Tensor, report: Tensor) -> None:
+        """Take over the results of a call."""
+        self.rows, self.report = rows, torch.maximum(self.report, report)
 
 
 class Steps(NamedTuple):
@@ -28,10 +49,12 @@ class Steps(NamedTuple):
     """Forced schedule of the fused op; None for the fastest one."""
     first: int = 0
     """Index of the first step in the rollout."""
+    bodies: MovingBodies | None = None
+    """Free bodies, which the fused op alone computes."""
 
     def part(self, n: int, first: int = 0) -> Steps:
         """n of these steps, after the first `first` of them."""
-        return Steps(self.step, n, self.dt, self.checkpoints, self.graph, self.schedule, self.first + first)
+        return self._replace(n=n, first=self.first + first)
 
     def control(self, state: State) -> contextlib.AbstractContextManager[Leave]:
         """Context of the motion of obstacles in these steps; its function returns the state with their final poses."""
