@@ -80,6 +80,12 @@ FITTING: tuple[tuple[str, str, str, str], ...] = (
     ),
     ("(law_|ops[.]substeps).*", "parameters", r"[[]\d[]] one dimension more", "a tensor [1]"),
     ("ops[.]plan_substeps", ".*", "= .*|complex|None", "torch makes a bool of it; numbers that no memory depends on"),
+    (
+        "ops[.].*bodies",
+        "bodies",
+        r"[[][15][]] one (more|less), axis 0",
+        "obstacles and gravity of all scenes or of each",
+    ),
     ("ops[.]latest_schedule", "like", ".*", "a tensor of any shape has a device"),
     ("ops[.]law_.*", "parameters", ".*(axis 0|one dimension more)", "uniform, or of more scenes than have particles"),
     (
@@ -108,6 +114,8 @@ FITTING: tuple[tuple[str, str, str, str], ...] = (
     ("contact", "velocity", "on meta", "a fake call"),
     ("contact", "mass", "None", "optional"),
     ("substeps_arguments", "blocks", "None", "optional"),
+    ("FreeBodies.advance", "wrenches", "None", "optional"),
+    ("ops[.]substeps.*", "tables", "axis 1", "any number of knots"),
     ("plan_rollout", "schedule|checkpoint", "None", "optional"),
     ("Step.failures", "state", "None", "optional"),
     ("Waypoints", "position", "a list", "as many lists of numbers"),

@@ -110,7 +110,18 @@ class _Calls:
             ("wall_impulses_backward", (self.normal(2, 2 * D, width).double(), True, *update)),
             ("contact_impulses", (mass, *obstacles)),
             ("contact_impulses_backward", (self.normal(2, 6, width).double(), True, mass, *obstacles)),
+            ("free_bodies", (velocity, mass, *self.bodies(), 0.1, True, *top)),
         ]
+
+    def bodies(self) -> tuple[Any, ...]:
+        """Two free bodies of three obstacles in two scenes."""
+        D, turns = self.dim, 1 if self.dim == 2 else 3
+        rows = self.uniform(2, 2, 6 if D == 2 else 13).double()
+        table = self.uniform(2, 3, 10 if D == 2 else 17)
+        constants = 0.5 + self.uniform(2, 1 + turns + 2 * D).double()
+        parts, forces = 0.1 * self.normal(3, D + turns).double(), self.normal(2, 2, D + turns).double()
+        tensors = [rows, table, self.uniform(0), constants, parts, self.normal(1, D).double(), forces]
+        return tensors, [1, 2, 1], [0, 0, 0], [3, 2, 1], [0, 0, 1], [1, 0], 20, 1e-5
 
     def heat(self) -> list[tuple[str, tuple[Any, ...]]]:
         x, N, blocks, top = self.x, self.N, self.blocks, self.topology
@@ -233,14 +244,18 @@ class _Calls:
         warm = (*self.obstacles, 0.1, 2, 40, True, False, False, None, *clocks, *conducts, [0, 1, 0], [table])
         look = (*fields[:5], self.F, *self.uniform(4, P), self.scene, 50.0, 2.0, True, 0.1, self.lattice.upper, 2)
         start = (*fields, 0.5 + self.uniform(P), None, [self.uniform(P)], *who, *laws, *how)
-        call, with_heat, with_adjoint = ((*start, *parts, *self.lattice.packed) for parts in (end, hot, warm))
-        facts = (False, True, D, PARTICLES, 2, 5, 27, 27, True, *[False] * 10, 1, *[False] * 8, 0, False)
+        resident = (*self.obstacles, 0.1, 2, 40, True, True, False, impulse, *clocks, *nothing)
+        call, with_heat, with_adjoint, with_bodies = (
+            (*start, *parts, *self.lattice.packed) for parts in (end, hot, warm, resident)
+        )
+        facts = (False, True, D, PARTICLES, 2, 5, 27, 27, True, *[False] * 10, 1, *[False] * 8, 0, 0, False, False)
         figures = (self.x, *call[4:7], call[8], self.scene, material, *laws, how[0], how[1], True)
         grads = [self.normal(*t.shape) for t in torch.ops.torch_mpm.substeps(*call)[:6]]
         of_heat = self.normal(*torch.ops.torch_mpm.substeps(*with_adjoint)[10].shape)
         return [
             ("substeps", call),
             ("substeps", with_heat),
+            ("substeps_with_bodies", (*self.bodies(), *with_bodies)),
             ("substeps_backward", ([*grads, torch.ones_like(impulse), None], 15, None, *call)),
             ("substeps_backward", ([*grads, None, of_heat], 239, None, *with_adjoint)),
             ("law_figures", figures),

@@ -5,8 +5,8 @@
 
 Balls: two balls on an elastic block in 3-D, one scene. Vessels: 735 particles of water in each scene, in a cup that
 swings on a hinge, and beside it a glass that slides, both of three boxes, in 2-D; as obstacles at rest ("obstacles"),
-and as bodies. Steps are those of one call, by the wall clock, with one wait for the device at the end. "Tracked" are steps
-whose gradient is wanted, forward only.
+and as bodies. Steps are those of one call, by the wall clock, with one wait for the device at the end. "Tracked" are
+steps whose gradient is wanted, forward only.
 """
 
 from __future__ import annotations

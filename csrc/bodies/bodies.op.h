@@ -112,6 +112,13 @@ template <class T, int D>
 void BodiesCall<T, D>::set_obstacles(const BodiesInputs& in, const Tensor& like, const PackedLattice& lattice,
                                      int64_t scenes) {
   const size_t count = in.shape.size();
+  const Tensor& table = given_[1];
+  check_rank(table, "obstacles of bodies", 3);
+  const int64_t table_rows = table.size(0) == 1 ? 1 : scenes;
+  check_shape(table, "obstacles of bodies", {table_rows, int64_t(count), ObstacleRow<T, D>::width});
+  check_like(table, "obstacles of bodies", like);
+  check_rank(given_[2], "data of bodies", 1);
+  check_like(given_[2], "data of bodies", like);
   constexpr double always = std::numeric_limits<double>::infinity();
   a_.contact = obstacle_arguments<T, D>(like, lattice, given_[1], given_[2], in.shape, in.sizes, in.contact,
                                         std::vector<int64_t>(count, -1), std::vector<double>(count),
@@ -147,15 +154,15 @@ void BodiesCall<T, D>::set_bodies(const BodiesInputs& in, const Tensor& like, in
                     int64_t(BodyJoint::count) - 1, ", got ", joint);
     a_.joint[k] = BodyJoint(joint);
   }
-  a_.constants =
-      reinterpret_cast<const BodyConstants<D>*>(doubles(given_[3], "constants", like, {K, BodyConstants<D>::width}));
+  a_.constants = reinterpret_cast<const BodyConstants<D>*>(
+      doubles(given_[3], "constants of bodies", like, {K, BodyConstants<D>::width}));
   a_.parts = reinterpret_cast<const PartPose<D>*>(
-      doubles(given_[4], "parts", like, {a_.contact.obstacles, PartPose<D>::width}));
-  check_rank(given_[5], "gravity of the bodies", 2);
+      doubles(given_[4], "parts of bodies", like, {a_.contact.obstacles, PartPose<D>::width}));
+  check_rank(given_[5], "gravity of bodies", 2);
   const int64_t of_gravity = given_[5].size(0) == 1 ? 1 : scenes;
-  a_.gravity = doubles(given_[5], "gravity of the bodies", like, {of_gravity, D});
+  a_.gravity = doubles(given_[5], "gravity of bodies", like, {of_gravity, D});
   a_.gravity_rows = int(of_gravity);
-  if (given_.size() == 7) a_.wrench = doubles(given_[6], "wrenches", like, {scenes, K, kMotions<D>});
+  if (given_.size() == 7) a_.wrench = doubles(given_[6], "wrenches of bodies", like, {scenes, K, kMotions<D>});
   doubles(given_[0], "rows of bodies", like, {scenes, K, kBodyRow<D>});
   rows_ = empty(like, {scenes, K, kBodyRow<D>}, ScalarType::Double);
   torch::stable::copy_(rows_, given_[0]);

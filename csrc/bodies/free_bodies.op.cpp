@@ -12,8 +12,9 @@ Step free_bodies(const Tensor& velocity, const Tensor& mass, MPM_BODIES_PARAMETE
                  const std::vector<Tensor>& topology, const std::vector<double>& lattice,
                  const std::vector<int64_t>& layout, MPM_CONTACT_WALLS_PARAMETERS) {
   const DeviceScope device(velocity);
-  check_rank(velocity, "velocity", 2);
-  Tensor after = empty(velocity, sizes_of(velocity)), rows, report, motion, slopes;
+  STD_TORCH_CHECK(velocity.dim() == 2 && (velocity.size(1) == 2 || velocity.size(1) == 3),
+                  "velocity must have shape [N, 2] or [N, 3], got ", shape_of(velocity));
+  Tensor after, rows, report, motion, slopes;
   dispatch(velocity, "velocity", velocity.size(1), [&]<class T, int D>() {
     const PackedTopology blocks(topology, lattice, layout);
     const int64_t nodes = blocks.node_count<D>();
@@ -29,6 +30,7 @@ Step free_bodies(const Tensor& velocity, const Tensor& mass, MPM_BODIES_PARAMETE
       slopes = empty(velocity, {scenes, K * n, K * n}, ScalarType::Double);
       call.set_solution(motion, slopes);
     }
+    after = empty(velocity, sizes_of(velocity));
     torch::stable::copy_(after, velocity);
     const int slots = blocks.max_blocks<D>();
     call.run(blocks.block_pointer(velocity), slots, slots, static_cast<const T*>(mass.data_ptr()), mass.stride(0),

@@ -28,6 +28,14 @@ def melting(state):
     return state.replace(extra=state.extra | {"liquid": torch.where(part, share, state.extra["liquid"])})
 
 
+def uneven(step, state, places=0.05, speeds=0.0):
+    """The state with other places, by a share of dx, and speeds [m/s]. The area of a free surface and the rate of strain
+    are norms, whose derivatives at zero are the direction of the rounding errors: so is the area inside of a lattice."""
+    g = torch.Generator().manual_seed(5)
+    noise = [(2 * torch.rand(state.x.shape, generator=g, dtype=F64) - 1).to(state.x) for _ in range(2)]
+    return state.replace(x=state.x + places * step.grid.dx * noise[0], v=state.v + speeds * noise[1])
+
+
 def with_leaves(step, state):
     """The state with leaves in the place of its tensors, and all leaves by name; sets those of the parameters."""
     leaves = {name: t for name in STATE if (t := getattr(state, name)) is not None} | state.extra
@@ -149,7 +157,7 @@ def test_absent_particles_and_those_outside(dim, transfer, device):
     state = state.replace(
         scene=state.scene.where(~absent, -1), v=torch.where(state.scene[:, None] == 1, outside, state.v)
     )
-    compare(step, state, 12)
+    compare(step, uneven(step, state, speeds=20.0), 12)
     start = state.replace(temperature=state.temperature.clone().requires_grad_())
     end = mpm.rollout(step, start, 12, DT).temperature
     (grad,) = torch.autograd.grad(end[absent].sum(), start.temperature)
@@ -213,7 +221,8 @@ def test_differences_over_200_steps_with_melting(transfer, device):
         h = 1e-6
         with torch.no_grad():
             expected = float(end(name, h)[0] - end(name, -h)[0]) / (2 * h)
-        assert abs(found - expected) <= 1e-6 * max(abs(found), 0.01), f"{name}: {found} and {expected}"
+        least = 0.1 if state.x.is_cuda else 0.01  # sums of nodes have another order in each run
+        assert abs(found - expected) <= 1e-6 * max(abs(found), least), f"{name}: {found} and {expected}"
 
 
 @pytest.mark.parametrize(*in_pairs(with_held=[False, True], name=[*terms(), "all"], dim=[2, 3], melts=[False, True]))
@@ -227,7 +236,7 @@ def test_free_surface_and_sources(dim, name, with_held, melts, device):
         region, plate = bodies(dim)["sphere"], bodies(dim)["plane"]
         step = held(step, (heat_boundaries.Fixed, region, 40.0), (heat_boundaries.Fixed, plate, -5.0))
         step.heat.boundaries = [*chosen, *step.heat.boundaries.entries]
-    compare(step, state, 4)
+    compare(step, uneven(step, state), 4)
 
 
 @pytest.mark.parametrize(*in_pairs(shape=bodies(2), dim=[2, 3], melts=[False, True], others=[False, True]))
@@ -238,7 +247,7 @@ def test_held_surfaces(dim, shape, melts, others, device):
     held_nodes = [(heat_boundaries.Fixed, mpm.Plane((0.0, 0.3, 0.0)[:dim], (0.0, 1.0, 0.0)[:dim]), -5.0)]
     step = held(step, (heat_boundaries.FixedSurface, bodies(dim)[shape], 40.0), *(held_nodes if others else []))
     step.heat.boundaries = [*chosen, *step.heat.boundaries.entries]
-    compare(step, state, 4)
+    compare(step, uneven(step, state), 4)
 
 
 @pytest.mark.parametrize("per_particle", [False, True])
@@ -255,7 +264,7 @@ def test_boundaries_of_scenes(per_particle, device):
         (heat_boundaries.Fixed, bodies(2)["plane"], temperatures),
     )
     step.heat.boundaries = [*chosen, *step.heat.boundaries.entries]
-    compare(step, state, 4, torch.tensor([1.0, 2.0, 0.5], dtype=F64) * DT)
+    compare(step, uneven(step, state), 4, torch.tensor([1.0, 2.0, 0.5], dtype=F64) * DT)
 
 
 NUMBERS = {"flux": 4e6, "coefficient": 3e4, "ambient": 40.0, "emissivity": 0.9, "power": 2e8, "temperature": 20.0}
