@@ -1,6 +1,7 @@
 #pragma once
 
 #include <cmath>
+#include <limits>
 
 #include "common/lanes.h"
 #include "grid/box_distance.h"
@@ -140,12 +141,28 @@ MPM_HD HeatRadiationAt<T> heat_of_term(HeatTerm term, const Vector<T, D>& normal
   return {T(0), amount};  // a flux
 }
 
+// Area of a node that is rounding, of places and of the sum (`area_rounding` in torch_mpm/heat/boundaries.py).
+template <class T, int D>
+MPM_HD T area_rounding(const Geometry<T, D>& g) {
+  T reach = T(0);
+  MPM_UNROLL for (int i = 0; i < D; i++) {
+    const T upper = g.lower[i] + T(g.blocks[i] * kBlockWidth) * g.dx,
+            low = g.lower[i] < T(0) ? -g.lower[i] : g.lower[i];
+    reach = upper > reach ? upper : reach;
+    reach = low > reach ? low : reach;
+  }
+  return std::numeric_limits<T>::epsilon() * (T(64) * g.dx + T(16) * reach) * (D == 2 ? T(1) : g.dx);
+}
+
+// The sum Σ V ∇N of a node. Inside of evenly spread particles it is rounding, whose direction means nothing: the
+// derivative of its length would be that direction. Such sums are zero.
 template <class T, int D>
 MPM_HD Vector<T, D> normal_of_node(const HeatTermArguments<T, D>& a, int64_t i) {
+  const T least = area_rounding(a.topology.geometry);
   Vector<T, D> normal;
   MPM_UNROLL for (int d = 0; d < D; d++)
     normal[d] = a.sums[i * kHeatChannels + 1 + d];
-  return normal;
+  return dot(normal, normal) <= least * least ? zero_vector<T, D>() : normal;
 }
 
 template <class T, int D>

@@ -24,7 +24,7 @@ from ..geometry.shapes import with_gradient
 from ..geometry.timed import tried
 from ..geometry.vectors import unit
 from ..grid.bspline import base_node, bspline
-from ..grid.grid import Blocks
+from ..grid.grid import Blocks, Grid
 from ..grid.topology import PADDING
 from ..laws.compiled import check_value
 from ..laws.parameters import TensorModule, Value, evaluate, needs_no_scenes
@@ -47,6 +47,13 @@ weight: heat into nearly empty nodes would make them hotter than the solve can b
 Number = float | Tensor
 Timed = Number | Callable[[float | Tensor], Number]
 """A number, a tensor, or a function of the time [s] that returns one of them."""
+
+
+def area_rounding(grid: Grid, dtype: torch.dtype) -> float:
+    """Area of a node that is rounding, of places and of the sum [m²] (m in 2-D). Inside of evenly spread particles the sum
+    Σ_p V_p ∇N_i is only that, and the derivative of its length would be its direction, which means nothing.
+    """
+    return torch.finfo(dtype).eps * (64 * grid.dx + 16 * grid.reach) * grid.dx ** (grid.dim - 2)
 
 
 @dataclasses.dataclass
@@ -92,9 +99,12 @@ class HeatNodes:
     @functools.cached_property
     def free_area(self) -> Tensor:
         """|Σ_p V_p ∇N_i(x_p)| [N] [m²], see `FreeSurface`."""
-        dim = self.blocks.grid.dim
-        nothing, gradient = pointwise("surface_normals", dim, self.volume)
-        (area,) = pointwise("length", dim, scatter(self.blocks, self.state.x, nothing, gradient=gradient))
+        grid = self.blocks.grid
+        nothing, gradient = pointwise("surface_normals", grid.dim, self.volume)
+        normal = scatter(self.blocks, self.state.x, nothing, gradient=gradient)
+        least = area_rounding(grid, normal.dtype)
+        normal = normal.where(~(normal.square().sum(1, keepdim=True) <= least**2), 0.0)  # NaN stays
+        (area,) = pointwise("length", grid.dim, normal)
         return area
 
     @functools.cached_property
