@@ -29,8 +29,10 @@ def melting(state):
 
 
 def uneven(step, state, places=0.05, speeds=0.0):
-    """The state with other places, by a share of dx, and speeds [m/s]. The area of a free surface and the rate of strain
-    are norms, whose derivatives at zero are the direction of the rounding errors: so is the area inside of a lattice."""
+    """The state with other places, by a share of dx, and speeds [m/s].
+
+    The area of a free surface and the rate of strain are norms. Their derivatives at zero are directions of rounding.
+    """
     g = torch.Generator().manual_seed(5)
     noise = [(2 * torch.rand(state.x.shape, generator=g, dtype=F64) - 1).to(state.x) for _ in range(2)]
     return state.replace(x=state.x + places * step.grid.dx * noise[0], v=state.v + speeds * noise[1])

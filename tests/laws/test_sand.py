@@ -80,8 +80,8 @@ def test_return_map_is_the_reference(device, dim, energy, apex, flow, dtype, shi
     assert torch.equal(result.branch.cpu(), expected[2])
     assert result.branch.unique().numel() == 3
     assert bool(result.converged.all())
-    # Elementary functions of a GPU differ by some ulps: the largest error is 67 eps there.
-    tolerance = (128 if device == "cuda" else 64) * torch.finfo(dtype).eps
+    # Elementary functions and LAPACK differ by some ulps: the largest error is 67 eps on a GPU, 83 eps on a CPU.
+    tolerance = 128 * torch.finfo(dtype).eps
     found = (result.F, result.stress, result.multiplier, result.dissipated)
     for value, wanted in zip(found, (*expected[:2], *expected[3:5]), strict=True):
         assert error(value, wanted) < tolerance

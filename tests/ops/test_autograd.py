@@ -178,6 +178,7 @@ NO_GRADIENT = {
     *("survey", "law_figures", "segment_clock", "pointwise_second", "take"),
     *("law_stiffness", "law_wave_modulus", "law_update_double_backward", "law_energy_double_backward"),
     *("heat_stencil", "heat_patches"),
+    *("free_bodies", "substeps_with_bodies"),  # they refuse: see FreeBodies
     *("law_tangent", "implicit_apply", "implicit_node_blocks", "implicit_cg"),  # they refuse: see the adjoint of a step
 }
 

@@ -50,8 +50,10 @@ Timed = Number | Callable[[float | Tensor], Number]
 
 
 def area_rounding(grid: Grid, dtype: torch.dtype) -> float:
-    """Area of a node that is rounding, of places and of the sum [m²] (m in 2-D). Inside of evenly spread particles the sum
-    Σ_p V_p ∇N_i is only that, and the derivative of its length would be its direction, which means nothing.
+    """Area of a node that is rounding, of places and of the sum [m²] (m in 2-D).
+
+    Inside of evenly spread particles the sum Σ_p V_p ∇N_i is only that. The derivative of its length would be its
+    direction, which means nothing.
     """
     return torch.finfo(dtype).eps * (64 * grid.dx + 16 * grid.reach) * grid.dx ** (grid.dim - 2)
 
