@@ -82,7 +82,7 @@ def growth(ratio: float, friction: float, share: float, solved: bool) -> tuple[f
         if solved:
             bodies.check()
             assert bodies.report is not None
-            most = max(most, bodies.report.iterations)
+            most = max(most, int(bodies.report.iterations.max()))
         now = energy(step, state, rows, mass)
         largest = max(largest, now / first if math.isfinite(now) else math.inf)
         if largest > STOP:
