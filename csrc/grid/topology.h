@@ -21,8 +21,8 @@ struct Topology {
   int64_t schedule_size = 0;
 };
 
-// Cost of a particle out of its block in a step, as a multiple of that of activating one particle, on CUDA: of a step,
-// and of one with heat, which has more kernels.
+// Cost of a particle out of its block, as a multiple of that of activating one, on CUDA. A step with heat has more
+// kernels.
 constexpr int kOutOfBlockCost = 2, kOutOfBlockCostWithHeat = 8;
 
 // Counters of the displacement of particles since their activation, which on CUDA may serve several steps.
@@ -35,7 +35,7 @@ struct Displacement {
   enum Loss : int { kLost = 1, kMissed = 2 };
 
   // Particles out of their block cost more than others. A new activation follows once their accumulated cost is that of
-  // an activation, that is, once `strays_of_activation` times their count exceeds the number of particles. The total
+  // an activation, that is, once `out_of_block_cost` times their count exceeds the number of particles. The total
   // cost is then at most twice the minimum.
   MPM_HD bool lasts(int64_t particles, int out_of_block_cost = kOutOfBlockCost) const {
     return lost == 0 && (int64_t(earlier) + out_of_block) * out_of_block_cost <= particles;

@@ -20,7 +20,6 @@ MPM_BACKEND_KERNELS(MPM_HEAT_KERNELS)
   PLAIN(heat_volumes, HeatVolumesArguments)             \
   ORDERED(heat_to_nodes, HeatToNodesArguments)          \
   PLAIN(heat_means, HeatMeansArguments)                 \
-  PLAIN(heat_largest, HeatLargestArguments)             \
   ORDERED(heat_surface, HeatSurfaceArguments)           \
   PLAIN(heat_add_term, HeatTermArguments)               \
   PLAIN(heat_hold, HeatHoldArguments)                   \
@@ -31,14 +30,17 @@ MPM_BACKEND_KERNELS(MPM_HEAT_KERNELS)
   ORDERED(heat_to_particles, HeatToParticlesArguments)
 MPM_BACKEND_KERNELS(MPM_HEAT_TRANSFER_KERNELS)
 
-// On CUDA alone.
-#define MPM_HEAT_SIMPLE_KERNELS(PLAIN, ORDERED, SIZE) \
-  ORDERED(heat_g2p_advance, HeatAdvanceArguments)     \
-  ORDERED(heat_exchange, ScatterArguments)            \
-  ORDERED(heat_simple_step, HeatSimpleArguments)      \
+// Of one backend alone.
+#define MPM_HEAT_CPU_KERNELS(PLAIN, ORDERED, SIZE) PLAIN(heat_largest, HeatLargestArguments)
+#define MPM_HEAT_CUDA_KERNELS(PLAIN, ORDERED, SIZE) \
+  ORDERED(heat_g2p_advance, HeatAdvanceArguments)   \
+  ORDERED(heat_exchange, ScatterArguments)          \
+  ORDERED(heat_simple_step, HeatSimpleArguments)    \
   PLAIN(heat_finish, HeatFinishArguments)
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda
-MPM_BACKEND_KERNELS(MPM_HEAT_SIMPLE_KERNELS)
+MPM_BACKEND_KERNELS(MPM_HEAT_CUDA_KERNELS)
+#else
+MPM_BACKEND_KERNELS(MPM_HEAT_CPU_KERNELS)
 #endif
 
 #define MPM_HEAT_BACKWARD_KERNELS(PLAIN, ORDERED, SIZE)                             \

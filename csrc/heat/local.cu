@@ -2,13 +2,10 @@
 
 #include "cuda/for_each.cuh"
 #include "heat/kernels.h"
-#include "heat/largest.cuh"
 
 // Steps of heat at single nodes, particles and scenes, and boundaries of heat.
 namespace mpm::cuda {
 namespace {
-
-constexpr int kThreads = 256;
 
 // The scene of a node, -1 where its slot has no block of the scenes; and its first node of the block.
 template <class T, int D>
@@ -53,33 +50,6 @@ MPM_HD void hold(const HeatHoldArguments<T, D>& a, int64_t i) {
 template <class T, int D>
 MPM_HD void layer(const HeatLayersArguments<T, D>& a, int64_t p) {
   heat_layer_of(a, pose_of(a.contact, a.obstacle, scene_of_particle(a, p)), p);
-}
-
-template <class T, int D>
-__global__ void __launch_bounds__(kThreads) largest_kernel(const __grid_constant__ HeatLargestArguments<T, D> a) {
-  grid_dependency_sync();
-  const auto raise_scene = [&](int64_t scene, long long wanted) { raise(a.largest + scene * a.stride, wanted); };
-  int64_t scene = -1;
-  long long largest = 0;
-  const int64_t stride = int64_t(gridDim.x) * kThreads;
-  for (int64_t p = int64_t(blockIdx.x) * kThreads + threadIdx.x; p < a.particles; p += stride) {
-    const int64_t given = a.scene.pointer ? a.scene.pointer[p * a.scene.stride[0]] : 0;
-    const int64_t own = given < 0 ? 0 : given < a.scenes ? given : a.scenes - 1;
-    if (own != scene && largest > 0) raise_scene(scene, largest);
-    if (own != scene) scene = own, largest = 0;
-    const long long bits = ordered_bits(double(a.value.pointer[p * a.value.stride[0]]));
-    if (bits > largest) largest = bits;
-  }
-  const int64_t first = __shfl_sync(~0u, scene, 0);  // a warp of one scene writes once
-  if (__all_sync(~0u, scene == first)) {
-#pragma unroll
-    for (int o = 16; o > 0; o /= 2) {
-      const long long other = __shfl_xor_sync(~0u, largest, o);
-      if (other > largest) largest = other;
-    }
-    if (threadIdx.x % 32 != 0) return;
-  }
-  if (largest > 0) raise_scene(scene, largest);
 }
 
 template <class T, int D>
@@ -141,14 +111,6 @@ void heat_count(const HeatCountArguments<T, D>& a, Stream stream) {
 }
 
 template <class T, int D>
-void heat_largest(const HeatLargestArguments<T, D>& a, Stream stream) {
-  constexpr int particles_of_thread = 16;
-  if (a.particles == 0) return;
-  const int64_t blocks = (a.particles + kThreads * particles_of_thread - 1) / (kThreads * particles_of_thread);
-  launch_in_chain(largest_kernel<T, D>, unsigned(blocks), kThreads, 0, stream, a);
-}
-
-template <class T, int D>
 void heat_hold(const HeatHoldArguments<T, D>& a, Stream stream) {
   for_each<hold<T, D>>(nodes_of(a.topology), a, stream);
 }
@@ -173,7 +135,6 @@ MPM_INSTANTIATE(heat_means, HeatMeansArguments)
 MPM_INSTANTIATE(heat_increments, HeatIncrementsArguments)
 MPM_INSTANTIATE(heat_count, HeatCountArguments)
 MPM_INSTANTIATE(heat_finish, HeatFinishArguments)
-MPM_INSTANTIATE(heat_largest, HeatLargestArguments)
 MPM_INSTANTIATE(heat_hold, HeatHoldArguments)
 MPM_INSTANTIATE(heat_layers, HeatLayersArguments)
 MPM_INSTANTIATE(heat_from_surface, HeatFromSurfaceArguments)

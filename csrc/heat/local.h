@@ -93,15 +93,24 @@ MPM_HD void heat_mean(const HeatMeansArguments<T, D>& a, int64_t i) {
   a.fixed[i] = false;
 }
 
+// A scene whose simple steps are not finite, or whose time step is negative. Nodes may report it at the same time.
+MPM_HD void report_unsolved(double* status) {
+  status[kLargestResidual] = double(NAN);
+  if (!(status[kUnsolved] > 0)) status[kUnsolved] = 1;
+}
+
 template <class T, int D>
 MPM_HD void finish_node(const HeatFinishArguments<T, D>& a, int scene, int64_t i) {
   const HeatArguments<T, D>& solve = a.simple.solve;
   const int steps = simple_steps(solve, scene);
   T increment = T(0);
-  if (steps > 0)
-    increment = simple_increment(a.simple, i, steps, step_of_scene(solve, scene));
-  else if (solve.heat_capacity[i] > T(0))  // the solver has no results of blocks without particles
+  if (steps > 0) {
+    const double dt = step_of_scene(solve, scene);
+    increment = simple_increment(a.simple, i, steps, dt);
+    if (dt < 0 || !(increment - increment == T(0))) report_unsolved(a.status + scene * kHeatStatusSize);
+  } else if (solve.heat_capacity[i] > T(0)) {  // the solver has no results of blocks without particles
     increment = solve.increment[i];
+  }
   a.sums[i * kHeatChannels + kHeatTheta] = increment + (solve.theta[i] - a.theta[i]);
 }
 

@@ -483,13 +483,13 @@ __global__ void __launch_bounds__(kSceneThreads<Order, T>)
   extern __shared__ __align__(16) unsigned char shared[];
   __shared__ SceneState<D> state;
   const int scene = int(blockIdx.x);
+  SceneSolver<Order, T, D> solver(kernel, state, scene, reinterpret_cast<T*>(shared));
+  solver.find_range();
+  solver.clear_unused();
   if (kernel.a.leaves_simple && simple_steps(kernel.a, scene) > 0) {
     if (threadIdx.x == 0) kernel.w.left[scene] = false;
     return;
   }
-  SceneSolver<Order, T, D> solver(kernel, state, scene, reinterpret_cast<T*>(shared));
-  solver.find_range();
-  solver.clear_unused();
   const bool small = solver.set_box();
   if (threadIdx.x == 0) kernel.w.left[scene] = !small;
   if (!small) return;

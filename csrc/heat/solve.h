@@ -50,7 +50,8 @@ struct HeatArguments {
   void* workspace = nullptr;  // bytes returned by heat_workspace()
 };
 
-// The steps of simple_steps() by kernels of their own, on CUDA: H u without packed particles, and then the increments.
+// Products H u of the simple steps on CUDA, by kernels without barriers of the grid, from particles that may have left
+// their base blocks.
 template <class T, int D>
 struct HeatSimpleArguments {
   HeatArguments<T, D> solve;       // its increments are those of the other scenes

@@ -248,7 +248,7 @@ struct HeatGather {
       T molten = liquid_before.at(p);
       const T front = melt(warm, molten, read_value(melting_point, p, l.scene), read_value(specific_heat, p, l.scene),
                            read_value(latent_heat, p, l.scene), number.at(p));
-      raise_by_warp(largest + l.scene * kHeatStatusSize, front);
+      if (front != T(0)) raise(largest + l.scene * kHeatStatusSize, ordered_bits(double(front)));
       liquid.at(p) = molten;
     }
     theta.at(p) = warm;

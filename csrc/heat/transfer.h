@@ -92,8 +92,8 @@ struct HeatToParticlesArguments {
   double dt = 0, moment_scale = 1;
   NodeField<const T> nodes;          // the sums from kHeatTheta on: increment and θ̄
   Field<T> theta, gradient, liquid;  // results, in other memory than the inputs
-  Field<T> changing;                 // diffusion number where the liquid fraction changes, else zero; may be absent
-  double* largest = nullptr;         // on CUDA: column [scenes] of the status, raised to the largest of these numbers
+  Field<T> changing;  // on the CPU: diffusion number where the liquid fraction changes, else zero; may be absent
+  double* largest = nullptr;  // on CUDA: column [scenes] of the status, raised to the largest of these numbers
 };
 
 // Nodes with matter in an obstacle are held at a temperature.
@@ -183,7 +183,7 @@ struct HeatCountArguments {
   double* status = nullptr;     // [scenes, kHeatStatusSize]
 };
 
-// The largest of a value of the particles in each scene, NaN where one is NaN.
+// The largest of a value of the particles in each scene, NaN where one is NaN; on the CPU.
 template <class T, int D>
 struct HeatLargestArguments {
   int64_t particles = 0, scenes = 0;

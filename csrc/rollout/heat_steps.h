@@ -42,6 +42,9 @@ class HeatSteps {
   // Whether begin() is needed: G2P has not stored the present volumes, or laws store what they dissipate.
   bool begins() const { return !has_volumes_ || heats_by_laws(); }
 
+  // Lets scenes of few simple steps have kernels of their own, on CUDA. The adjoint needs the increments of the solver.
+  void take_simple_steps() { simple_ = true; }
+
   // Computes the present volumes; before laws change F.
   void begin(const Field<const T>& F, const Field<const T>& J, const Field<const T>& rest, backend::Stream stream) {
     HeatVolumesArguments<T, D> a;
@@ -74,8 +77,7 @@ class HeatSteps {
     HeatToParticlesArguments<T, D> up = to_particles(solution.down);
     backend::heat_to_particles(in_.lattice.order(), up, stream);
     fields.go(true);
-    if (melts() && MPM_BACKEND == MPM_BACKEND_IS_cpu)
-      find_largest(field<const T>(changing_), scene, rows_of_status() + kLargestFront, kHeatStatusSize, stream);
+    if (melts()) find_largest(changing_, scene, rows_of_status() + kLargestFront, kHeatStatusSize, stream);
   }
 
   // The part of a substep up to the node temperatures, with the increments of an earlier solve where they are known.
@@ -85,6 +87,7 @@ class HeatSteps {
     make_nodes(stream);
     HeatToNodesArguments<T, D> down = to_nodes(x, mass, velocity_gradient);
     backend::heat_to_nodes(in_.lattice.order(), down, stream);
+    find_largest(number_, scene, largest_, 1, stream);
     if (holds_surface()) add_layers(x, scene, stream);
     means(stream);
     if (has_terms()) add_terms(x, rest, stream);
@@ -94,7 +97,7 @@ class HeatSteps {
     else if (takes_simple_steps())
       solve_by_simple_steps(a, stream);
     else
-      solve(a, scene, stream);
+      solve(a, stream);
     return {down, a, static_cast<const T*>(theta_.data_ptr())};
   }
 
@@ -140,11 +143,8 @@ class HeatSteps {
   // The gradient is the last tensor of `heat`.
   bool has_gradient() const { return in_.heat.size() % 3 == 1; }
   bool exchanges() const { return holds_surface() || has_terms(); }
-  // Whether scenes of few simple steps have kernels of their own. Sums on deterministic grids have an order, and the
-  // adjoint reads the increments of the solver.
-  bool takes_simple_steps() const {
-    return MPM_BACKEND == MPM_BACKEND_IS_cuda && !in_.lattice.deterministic() && in_.resident;
-  }
+  // Whether scenes of few simple steps have kernels of their own. Sums on deterministic grids have an order.
+  bool takes_simple_steps() const { return simple_ && !in_.lattice.deterministic(); }
   double* rows_of_status() const { return static_cast<double*>(status.data_ptr()); }
   const T* held_temperature(int64_t k) const { return temperatures_.pointer + k * temperatures_.stride[0]; }
 
@@ -171,10 +171,10 @@ class HeatSteps {
   HeatToNodesArguments<T, D> to_nodes(const Field<const T>& x, const Field<const T>& mass,
                                       const Field<const T>& velocity_gradient) const;
   HeatArguments<T, D> equations(const Field<const T>& x, backend::Stream stream);
-  void solve(HeatArguments<T, D>& a, const Field<const int>& scene, backend::Stream stream);
+  void solve(HeatArguments<T, D>& a, backend::Stream stream);
   void use_increments(const HeatArguments<T, D>& a, const T* increments, backend::Stream stream);
   void solve_by_simple_steps(HeatArguments<T, D>& a, backend::Stream stream);
-  void find_largest(const Field<const T>& of, const Field<const int>& scene, double* to, int64_t stride,
+  void find_largest(const Tensor& values, const Field<const int>& scene, double* to, int64_t stride,
                     backend::Stream stream) const;
 
   Substeps<T, D>& s_;
@@ -183,7 +183,7 @@ class HeatSteps {
   std::vector<HeatValue<T>> values_;  // of the parameters; those per particle have no pointer
   std::vector<int> own_;              // index in `parameters`, or -1
   Tensor conductance_, blend_, number_, changing_, strain_rate_ = absent();
-  bool has_volumes_ = false;
+  bool has_volumes_ = false, simple_ = false;
   Field<const T> temperatures_;   // of the held obstacles [K, B]
   Tensor exchange_of_particles_;  // with the held surface
   Tensor start_, fixed_;
@@ -462,11 +462,16 @@ HeatToParticlesArguments<T, D> HeatSteps<T, D>::to_particles(const HeatToNodesAr
   return a;
 }
 
+// Raises `to` to the largest value of the particles of each scene. On CUDA the kernels that compute the values do that.
 template <class T, int D>
-void HeatSteps<T, D>::find_largest(const Field<const T>& of, const Field<const int>& scene, double* to, int64_t stride,
-                                   backend::Stream stream) const {
+void HeatSteps<T, D>::find_largest([[maybe_unused]] const Tensor& values,
+                                   [[maybe_unused]] const Field<const int>& scene, [[maybe_unused]] double* to,
+                                   [[maybe_unused]] int64_t stride, [[maybe_unused]] backend::Stream stream) const {
+#if MPM_BACKEND == MPM_BACKEND_IS_cpu
   if (in_.scenes > 0)
-    backend::heat_largest(HeatLargestArguments<T, D>{particles(), in_.scenes, of, scene, to, stride}, stream);
+    backend::heat_largest(
+        HeatLargestArguments<T, D>{particles(), in_.scenes, field<const T>(values), scene, to, stride}, stream);
+#endif
 }
 
 template <class T, int D>
@@ -576,8 +581,7 @@ HeatArguments<T, D> HeatSteps<T, D>::equations(const Field<const T>& x, backend:
 
 // Solves the equations of all scenes, and adds the solves to the status.
 template <class T, int D>
-void HeatSteps<T, D>::solve(HeatArguments<T, D>& a, const Field<const int>& scene, backend::Stream stream) {
-  if (MPM_BACKEND == MPM_BACKEND_IS_cpu) find_largest(field<const T>(number_), scene, largest_, 1, stream);
+void HeatSteps<T, D>::solve(HeatArguments<T, D>& a, backend::Stream stream) {
   backend::heat_cg(in_.lattice.order(), a, stream);
   use_increments(a, a.increment, stream);
   backend::heat_count(

@@ -138,7 +138,8 @@ struct ScheduleEntry {
 };
 
 // Whether sums of nodes are independent of the order of their terms, in deterministic mode on CUDA. Only without
-// gradients: the backward pass recomputes its steps one by one. The sums of heat have an order.
+// gradients: the backward pass recomputes its steps one by one. With heat, sums keep their order,
+// as the solver adds in it.
 inline bool sums_are_fixed(const PlanFacts& f) {
   return f.cuda && f.float32 && f.deterministic && !f.gradients && !f.impulses && !f.clocks && !f.mirrors && !f.heat;
 }

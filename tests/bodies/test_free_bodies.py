@@ -127,6 +127,17 @@ def test_a_driven_body_is_an_obstacle_that_moves(dim, device):
     assert float(end.v.abs().max()) > 0.1
 
 
+def test_a_joint_that_changes_between_calls(device):
+    """A free body falls, and then stays where it is driven, as a new object computes."""
+    step, state = material(2, device, gravity=(0.0, -9.8))
+    body = ball_of(2)
+    bodies, rows = FreeBodies(step, [body]), rows_of(2, (1.0, 1.8), (0.0, 0.0), device=device)
+    with torch.no_grad():
+        assert float(bodies.advance(state, rows, 2, 1e-3)[1][0, 0, 4]) < -0.01
+        body.joint = Driven()
+        assert float(bodies.advance(state, rows, 2, 1e-3)[1][0, 0, 4]) == 0
+
+
 def test_a_hinge_keeps_its_distance_and_its_energy(device):
     """A pendulum of a disc: the anchor stays where it is; in gravity alone its energy stays to the order of dt."""
     step, state = material(2, device, gravity=(0.0, -9.8))

@@ -136,6 +136,15 @@ def test_stiff_conduction(device):
     compare(step, state, 3, tolerance=1e-8)
 
 
+@pytest.mark.parametrize("conductivity", [2e2, 2e4, 2e6])
+@pytest.mark.parametrize("checkpoint", [2, mpm.Checkpoints(memory=1e9)])
+def test_many_particles_in_a_cell(conductivity, checkpoint, device):
+    """Their record has the nodes and the increments of each solve, which the adjoint does not compute once more."""
+    step, state = scene(2, per_cell=64, device=device)
+    step.heat.conductivity = conductivity
+    compare(step, state, 3, tolerance=1e-8, checkpoint=checkpoint)
+
+
 def test_parameters_of_materials(device):
     """Parts of a parameter, by the autograd of torch before the op."""
     step, state = scene(2, law="mixture", device=device)

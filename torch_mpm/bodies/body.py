@@ -21,7 +21,7 @@ NOT_ALLOWED = 1e-5
 class Joint:
     """Motion that a body is free to have. This one allows all of it."""
 
-    name: ClassVar = "free"
+    name: ClassVar[str] = "free"
     """The joint among `torch_mpm.ops.free_bodies.JOINTS`."""
 
     def directions(self, position: Tensor) -> Tensor | None:
@@ -44,7 +44,7 @@ class Hinge(Joint):
         axis: its direction, 3 numbers of any length but zero; None in 2-D.
     """
 
-    name: ClassVar = "hinge"
+    name: ClassVar[str] = "hinge"
 
     def __init__(self, anchor: Sequence[float], axis: Sequence[float] | None = None) -> None:
         self.anchor = check_vector("anchor", anchor)
@@ -71,7 +71,7 @@ class Slider(Joint):
         axis: the direction, D numbers of any length but zero.
     """
 
-    name: ClassVar = "slider"
+    name: ClassVar[str] = "slider"
 
     def __init__(self, axis: Sequence[float]) -> None:
         self.axis = _unit("axis", axis)
@@ -89,7 +89,7 @@ class Slider(Joint):
 class Driven(Joint):
     """No motion but the velocity that the body is given: nothing pushes it."""
 
-    name: ClassVar = "driven"
+    name: ClassVar[str] = "driven"
 
     def directions(self, position: Tensor) -> Tensor | None:
         return position.new_zeros(len(position), VELOCITY[position.shape[1]], 0)

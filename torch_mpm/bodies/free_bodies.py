@@ -224,7 +224,7 @@ class FreeBodies:
     def tables(self, like: Tensor) -> BodyTables:
         """Tables of the ops for nodes of the dtype and device of `like`, which are cached while nothing changes."""
         values = [value for obstacle in self.obstacles for value in values_without_motion(obstacle)]
-        of_bodies = [(b.mass, b.inertia, *vars(b.joint).values()) for b in self.bodies]
+        of_bodies = [(b.mass, b.inertia, b.joint.name, *vars(b.joint).values()) for b in self.bodies]
         kinds = [obstacle.kind for obstacle in self.obstacles]
         key = (like.dtype, like.device, like.shape[1], *kinds, *of_bodies, *values)
         scenes, frames = self.step.grid.scenes, self.frames
