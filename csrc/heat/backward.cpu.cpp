@@ -1,3 +1,4 @@
+#include "heat/blocks.cpu.h"
 #include "heat/local_backward.h"
 #include "transfer/gather.cpu.h"
 
@@ -68,27 +69,6 @@ void from_nodes(const HeatToNodesBackwardArguments<T, D>& a) {
                        [&](const Group& g, const Lanes<T> f[D], int scene, const T* tile) {
                          pull_back(a, g, scene, gathered<Order, kHeatChannels, Affine, T, D>(f, tile, dx));
                        });
-}
-
-// visit(scene, corner, slot) for the blocks of the scenes, and visit(scene, node) for their nodes.
-template <class T, int D, class F>
-void for_blocks(const Topology<T, D>& t, const F& visit) {
-  constexpr int64_t grain = 64;  // slots below which a range is not split
-  parallel_ranges(t.max_blocks, grain, [&](int64_t begin, int64_t end) {
-    for (int64_t slot = begin; slot < end; slot++) {
-      const int block = t.block[slot];
-      if (block < 0 || block / t.geometry.blocks_per_scene >= t.scenes) continue;
-      const BaseBlock<T, D> base(t, int(slot));
-      visit(base.scene, base.corner, slot);
-    }
-  });
-}
-
-template <class T, int D, class F>
-void for_nodes(const Topology<T, D>& t, const F& visit) {
-  for_blocks(t, [&](int scene, const int (&)[D], int64_t slot) {
-    for (int64_t i = slot * kBlockNodes<D>; i < (slot + 1) * kBlockNodes<D>; i++) visit(scene, i);
-  });
 }
 
 }  // namespace

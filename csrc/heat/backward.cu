@@ -1,6 +1,7 @@
 #include "heat/local_backward.h"
 
 #include "cuda/for_each.cuh"
+#include "heat/blocks.cuh"
 #include "heat/kernels.h"
 #include "transfer/gather.cuh"
 
@@ -80,13 +81,6 @@ struct HeatToNodesPullBack : HeatAdjointSums<Order, T, D, kHeatChannels, kHeatTh
   __device__ void skip(int p) const { skip_heat_of_nodes_backward(a, p); }
 };
 
-// Calls work(a, scene, i) at a node of a block of the scenes.
-template <auto work, class T, int D, class Arguments>
-MPM_HD void at_node(const Topology<T, D>& t, const Arguments& a, int64_t i) {
-  const int block = t.block[i / kBlockNodes<D>], scene = block / t.geometry.blocks_per_scene;
-  if (block >= 0 && scene < t.scenes) work(a, scene, i);
-}
-
 template <class T, int D>
 MPM_HD void term_backward(const HeatTermBackwardArguments<T, D>& a, int64_t i) {
   at_node<heat_of_term_backward<T, D>>(a.forward.topology, a, i);
@@ -95,18 +89,6 @@ MPM_HD void term_backward(const HeatTermBackwardArguments<T, D>& a, int64_t i) {
 template <class T, int D>
 MPM_HD void node_backward(const HeatNodesBackwardArguments<T, D>& a, int64_t i) {
   at_node<heat_of_node_backward<T, D>>(a.topology, a, i);
-}
-
-// Calls work(a, scene, corner, slot) for the block of a slot.
-template <auto work, class T, int D, class Arguments>
-MPM_HD void at_slot(const Topology<T, D>& t, const Arguments& a, int64_t slot) {
-  const int block = t.block[slot];
-  if (block < 0) return;
-  int corner[D];
-  const int scene = block_coordinates(t.geometry, block, corner);
-  MPM_UNROLL for (int i = 0; i < D; i++)
-    corner[i] *= kBlockWidth;
-  if (scene < t.scenes) work(a, scene, corner, slot);
 }
 
 template <class T, int D>
@@ -122,11 +104,6 @@ MPM_HD void held_backward(const HeatHeldBackwardArguments<T, D>& a, int64_t slot
 template <class T, int D>
 MPM_HD void surface_temperature_backward(const HeatSurfaceTemperatureBackwardArguments<T, D>& a, int64_t slot) {
   at_slot<surface_temperature_of_slot<T, D>>(a.topology, a, slot);
-}
-
-template <class T, int D>
-int64_t nodes_of(const Topology<T, D>& t) {
-  return int64_t(t.max_blocks) * kBlockNodes<D>;
 }
 
 }  // namespace

@@ -1,34 +1,16 @@
-#include "cpu/base_block.h"
-#include "cpu/parallel.h"
+#include "heat/blocks.cpu.h"
 #include "heat/local.h"
 
 // Boundaries of heat at the nodes: temperatures that obstacles hold, in them and near their surfaces; and the free
 // surface.
 namespace mpm::cpu {
 inline namespace TORCH_MPM_ISA {
-namespace {
-
-// visit(first node, scene, corner) of each slot with a block.
-template <class T, int D, class F>
-void for_blocks(const Topology<T, D>& t, const F& visit) {
-  constexpr int64_t grain = 64;  // slots below which a range is not split
-  parallel_ranges(t.max_blocks, grain, [&](int64_t begin, int64_t end) {
-    for (int64_t slot = begin; slot < end; slot++) {
-      const int block = t.block[slot];
-      if (block < 0 || block / t.geometry.blocks_per_scene >= t.scenes) continue;
-      const BaseBlock<T, D> base(t, int(slot));
-      visit(slot * kBlockNodes<D>, base.scene, base.corner);
-    }
-  });
-}
-
-}  // namespace
-
 template <class T, int D>
 void heat_hold(const HeatHoldArguments<T, D>& a) {
-  for_blocks(a.topology, [&](int64_t first, int scene, const int (&corner)[D]) {
+  for_blocks(a.topology, [&](int scene, const int (&corner)[D], int64_t slot) {
     const ObstaclePose<T, D> pose = pose_of(a.contact, a.obstacle, scene);
     if (!pose.acts) return;
+    const int64_t first = slot * kBlockNodes<D>;
     for (int local = 0; local < kBlockNodes<D>; local++) hold_node(a, pose, scene, corner, local, first + local);
   });
 }
@@ -49,16 +31,12 @@ void heat_layers(const HeatLayersArguments<T, D>& a) {
 
 template <class T, int D>
 void heat_from_surface(const HeatFromSurfaceArguments<T, D>& a) {
-  for_blocks(a.topology, [&](int64_t first, int scene, const int (&)[D]) {
-    for (int64_t i = first; i < first + kBlockNodes<D>; i++) heat_of_surface(a, scene, i);
-  });
+  for_nodes(a.topology, [&](int scene, int64_t i) { heat_of_surface(a, scene, i); });
 }
 
 template <class T, int D>
 void heat_add_term(const HeatTermArguments<T, D>& a) {
-  for_blocks(a.topology, [&](int64_t first, int scene, const int (&)[D]) {
-    for (int64_t i = first; i < first + kBlockNodes<D>; i++) heat_term(a, scene, i);
-  });
+  for_nodes(a.topology, [&](int scene, int64_t i) { heat_term(a, scene, i); });
 }
 
 MPM_INSTANTIATE(heat_add_term, HeatTermArguments)

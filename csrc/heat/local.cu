@@ -1,35 +1,12 @@
 #include "heat/local.h"
 
 #include "cuda/for_each.cuh"
+#include "heat/blocks.cuh"
 #include "heat/kernels.h"
 
 // Steps of heat at single nodes, particles and scenes, and boundaries of heat.
 namespace mpm::cuda {
 namespace {
-
-// The scene of a node, -1 where its slot has no block of the scenes; and its first node of the block.
-template <class T, int D>
-MPM_HD int scene_of_node(const Topology<T, D>& t, int64_t node, int (&corner)[D]) {
-  const int block = t.block[node / kBlockNodes<D>];
-  if (block < 0) return -1;
-  const int scene = block_coordinates(t.geometry, block, corner);
-  MPM_UNROLL for (int i = 0; i < D; i++)
-    corner[i] *= kBlockWidth;
-  return scene < t.scenes ? scene : -1;
-}
-
-template <class T, int D>
-MPM_HD int64_t nodes_of(const Topology<T, D>& t) {
-  return int64_t(t.max_blocks) * kBlockNodes<D>;
-}
-
-// Calls work(a, scene, i) at a node of a block of the scenes.
-template <auto work, int D, class Arguments>
-MPM_HD void at_node(const Arguments& a, int64_t i) {
-  int corner[D];
-  const int scene = scene_of_node(a.topology, i, corner);
-  if (scene >= 0) work(a, scene, i);
-}
 
 __host__ __device__ inline void request_activation([[maybe_unused]] Displacement* displacement) {
 #ifdef __CUDA_ARCH__
@@ -41,7 +18,7 @@ template <class T, int D>
 MPM_HD void hold(const HeatHoldArguments<T, D>& a, int64_t i) {
   if (a.fixed[i] || !(a.capacity[i] > T(0))) return;
   int corner[D];
-  const int scene = scene_of_node(a.topology, i, corner);
+  const int scene = scene_of_slot(a.topology, i / kBlockNodes<D>, corner);
   if (scene < 0) return;
   const ObstaclePose<T, D> pose = pose_of(a.contact, a.obstacle, scene);
   if (pose.acts) hold_node(a, pose, scene, corner, int(i % kBlockNodes<D>), i);
@@ -50,6 +27,16 @@ MPM_HD void hold(const HeatHoldArguments<T, D>& a, int64_t i) {
 template <class T, int D>
 MPM_HD void layer(const HeatLayersArguments<T, D>& a, int64_t p) {
   heat_layer_of(a, pose_of(a.contact, a.obstacle, scene_of_particle(a, p)), p);
+}
+
+template <class T, int D>
+MPM_HD void from_surface(const HeatFromSurfaceArguments<T, D>& a, int64_t i) {
+  at_node<heat_of_surface<T, D>>(a.topology, a, i);
+}
+
+template <class T, int D>
+MPM_HD void add_term(const HeatTermArguments<T, D>& a, int64_t i) {
+  at_node<heat_term<T, D>>(a.topology, a, i);
 }
 
 template <class T, int D>
@@ -76,10 +63,7 @@ template <class T, int D>
 MPM_HD void finish(const HeatFinishArguments<T, D>& a, int64_t i) {
   const Topology<T, D>& t = a.simple.solve.topology;
   if (i < t.scenes) finish_scene(a, i);
-  if (i >= nodes_of(t)) return;
-  int corner[D];
-  const int scene = scene_of_node(t, i, corner);
-  if (scene >= 0) finish_node(a, scene, i);
+  if (i < nodes_of(t)) at_node<finish_node<T, D>>(t, a, i);
 }
 
 }  // namespace
@@ -122,12 +106,12 @@ void heat_layers(const HeatLayersArguments<T, D>& a, Stream stream) {
 
 template <class T, int D>
 void heat_from_surface(const HeatFromSurfaceArguments<T, D>& a, Stream stream) {
-  for_each<at_node<heat_of_surface<T, D>, D, HeatFromSurfaceArguments<T, D>>>(nodes_of(a.topology), a, stream);
+  for_each<from_surface<T, D>>(nodes_of(a.topology), a, stream);
 }
 
 template <class T, int D>
 void heat_add_term(const HeatTermArguments<T, D>& a, Stream stream) {
-  for_each<at_node<heat_term<T, D>, D, HeatTermArguments<T, D>>>(nodes_of(a.topology), a, stream);
+  for_each<add_term<T, D>>(nodes_of(a.topology), a, stream);
 }
 
 MPM_INSTANTIATE(heat_volumes, HeatVolumesArguments)

@@ -301,7 +301,8 @@ MPM_HD Dual<T> distance_along(const HeatLayersArguments<T, D>& a, int scene, con
   return distance_from(obstacle_pose(a.contact, a.contact.kind[a.obstacle], moved, scene), x);
 }
 
-// At any particle: its conductance κ V, of which a share remains and another is exchanged, and its distance.
+// Adjoints of the conductance κ V of a particle and of its distance from the surface. A share of κ V conducts, and
+// another exchanges heat with the surface.
 template <class T, int D>
 MPM_HD void heat_layer_backward(const HeatLayersBackwardArguments<T, D>& a, int64_t p) {
   const One<T> at{p};

@@ -5,8 +5,8 @@
         wall_plane=[]) -> (velocity, rows, report, motion, slopes)
 
 `bodies` are tensors: rows [B, K, 13] or [B, K, 6] of the bodies at the beginning of the step (torch_mpm.bodies), the
-table of their obstacles [1 or B, O, width] and the data of the shapes as in `contact`, of which friction and shape are
-read; constants [K, ...]: mass, moments of inertia (one in 2-D, three in 3-D), a point on the hinge [D] and the axis of
+table of their obstacles [1 or B, O, width] and the data of the shapes as in `contact` (the op reads friction and shape
+only); constants [K, ...]: mass, moments of inertia (one in 2-D, three in 3-D), a point on the hinge [D] and the axis of
 the joint [D]; poses of the obstacles in the frames of their bodies [O, D + 1 or 3], positions and rotations; gravity
 [1 or B, D] of the bodies, and wrenches [B, K, 3 or 6], which may be left out. All but the table and the data are
 float64. `body_owner` are the bodies of the obstacles, `body_joint` the numbers of `JOINTS`.
