@@ -6,7 +6,8 @@
 
 The cube of `benchmarks/speed/work.py`, 3-D, float32, one call of `torch_mpm.rollout`; each row beside another of the
 same run. Heat has a diffusion number of `work.DIFFUSION`. `until a time` is `torch_mpm.rollout_to` beside the same
-substeps of fixed length. Warp takes substeps with heat of the same cube (`heat_peer_warp.py`), on CPUs by one thread,
+substeps of fixed length. `forward and backward` is a loss and its gradients beside the same substeps without
+gradients. Warp takes substeps with heat of the same cube (`heat_peer_warp.py`), on CPUs by one thread,
 where it is installed (`pip install torch-mpm[bench]`). The sizes of the libraries are those of their files. On CUDA
 each kernel of a substep with heat stands beside the limits of the memory and of the arithmetic (`heat_kernels.py`).
 """
@@ -25,7 +26,7 @@ import torch_mpm as mpm
 from torch_mpm import _library
 
 from .. import common, regressions
-from . import heat_kernels, peers, rollouts, work
+from . import heat_kernels, memory, peers, rollouts, work
 from .step import LARGE, STEPS, Setup, difference, run_peer, setup
 from .timing import Clock, copy_ms
 
@@ -35,6 +36,9 @@ TIMED_SIDES = {"cpu": (22, 40), "cuda": (40, 80, 200)}
 KERNEL_SIDES = {"cpu": (), "cuda": (100, 200)}
 """Of the kernels of a substep with heat."""
 BATCHES = {"cpu": ((64, 512),), "cuda": ((256, 2197), (1024, 2197))}
+GRADIENT_SIDES = {"cpu": (22,), "cuda": (46,)}
+GRADIENT_STEPS, GRADIENT_MEMORY = {"cpu": 100, "cuda": 1000}, 1.5e9
+"""Substeps of a loss, and the limit of its stored states [bytes]."""
 DIFFUSION = 1e-4
 """κ dt / (ρ c dx²) of heat."""
 MOST_SUBSTEPS = 4096
@@ -139,6 +143,34 @@ def after_steps(side: int, device: str) -> mpm.State:
         return mpm.rollout(s.step, s.state, STEPS, work.DT)
 
 
+def with_gradients(s: Setup, device: str, samples: int, steps: int) -> dict[str, Any]:
+    """A loss of the temperatures and positions after some substeps and its gradients by the temperatures and
+    velocities, beside these substeps without gradients."""
+    state = s.state.sorted(s.step.grid)
+    checkpoints = mpm.Checkpoints(memory=GRADIENT_MEMORY)
+
+    def forward() -> mpm.State:
+        with torch.no_grad():
+            return mpm.rollout(s.step, state, steps, work.DT)
+
+    def gradients() -> tuple[torch.Tensor, ...]:
+        v, theta = (f.clone().requires_grad_() for f in (state.v, temperature_of(state)))
+        end = mpm.rollout(s.step, state.replace(v=v, temperature=theta), steps, work.DT, checkpoints)
+        loss = end.x.square().sum() + temperature_of(end).square().mean()
+        return torch.autograd.grad(loss, (v, theta))
+
+    taken = memory.of_cuda(gradients) if device == "cuda" else memory.of_returned_tensors(gradients)
+    plain, both = (rollouts.least(device, work_, samples) / steps for work_ in (forward, gradients))
+    rate = len(state) / both
+    row = {"name": "heat, forward and backward", "particles": len(state), "steps": steps, "us": both * 1e6}
+    return {**row, "rate": rate, "beside": f"heat, {plain * 1e6:.3g} us", "times": both / plain, "memory": taken}
+
+
+def temperature_of(state: mpm.State) -> torch.Tensor:
+    assert state.temperature is not None
+    return state.temperature
+
+
 def library_sizes() -> dict[str, int]:
     """Bytes of the library files of this installation."""
     files = (_library.CPU_LIBRARY, _library.CUDA_LIBRARY)
@@ -178,6 +210,9 @@ def measure(device: str, quick: bool = False) -> dict[str, Any]:
         batch = rollouts.batched(scenes, particles, device)
         cubes = list(beside_each_other(batch, ("neo-Hookean", "heat"), device, samples))
         rows += [*cubes, *of_peer(device, rollouts.side_of(particles), scenes, us_of(named("heat", scenes), cubes))]
+    for side in (6,) if quick else GRADIENT_SIDES[device]:
+        cube, steps = heated(setup(work.make(side), device)), 10 if quick else GRADIENT_STEPS[device]
+        rows.append(with_gradients(cube, device, min(samples, 2), steps))
     for side in (6,) if quick else TIMED_SIDES[device]:
         rows.append(until_a_time(setup(work.make(side), device), device, samples))
     rows += [until_a_time(rollouts.batched(*batch, device), device, samples) for batch in batches]
@@ -218,6 +253,9 @@ def notes(result: dict[str, Any]) -> Iterator[str]:
             "the first residual at most."
         )
         yield f"Its temperatures, 0 to 10 K, are within {max(found):.1e} K of those of `heat` after {STEPS} substeps."
+    for r in result["rows"]:
+        if "memory" in r:
+            yield f"Forward and backward of {r['steps']} substeps take {r['memory'] / 1e6:.0f} MB."
     if sizes := result.get("libraries"):
         yield "Libraries: " + ", ".join(f"{name} {size / 1e6:.1f} MB" for name, size in sizes.items()) + "."
 
