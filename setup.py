@@ -44,7 +44,7 @@ COMMON_FLAGS = ["-std=c++20", f"-DTORCH_TARGET_VERSION={TORCH_TARGET_VERSION}"]
 # Objects are made in build/<platform>; checks report __FILE__ relative to the source tree.
 UP = "../../"
 HOST_FLAGS = ["-fPIC", "-fvisibility=hidden", "-Wall", f"-ffile-prefix-map={UP}="]
-# One thread of nvcc per architecture (--threads); template kernels make large fat binaries, so they are compressed.
+# One thread of nvcc per architecture (--threads).
 NVCC_THREADS = 2
 # Device code that calls a function of the host alone would compile with a warning, and the call would do nothing.
 NVCC_FLAGS = [
@@ -53,7 +53,6 @@ NVCC_FLAGS = [
     "--Werror",
     "cross-execution-space-call",
     f"--threads={NVCC_THREADS}",
-    "-Xfatbin=-compress-all",
 ]
 
 # Definitions that distinguish the objects of one source.
@@ -134,6 +133,13 @@ def gencode() -> list[str]:
     return [*options, f"-gencode=arch=compute_{numbers[-1]},code=compute_{numbers[-1]}"]
 
 
+def compression() -> str:
+    """Option of nvcc that compresses fat binaries, which are large for template kernels. The smallest ones need the
+    driver of CUDA 12.4, which every driver of CUDA 13 is newer than, but not every one of CUDA 12."""
+    release = re.search(r"release (\d+)", compiler_version(str(nvcc())))
+    return "--compress-mode=size" if release and int(release[1]) >= 13 else "-Xfatbin=-compress-all"
+
+
 def max_jobs() -> int:
     return int(os.environ.get("MAX_JOBS") or len(os.sched_getaffinity(0)))
 
@@ -189,7 +195,16 @@ class Ninja:
         if nvcc() is not None:
             # The host compiler sees `#pragma unroll`, which only the device compiler knows.
             host = f"-Xcompiler={','.join([*HOST_FLAGS, '-Wno-unknown-pragmas'])}"
-            device = [str(nvcc()), f"-ccbin={cxx}", *gencode(), *COMMON_FLAGS, *NVCC_FLAGS, host, "-DUSE_CUDA"]
+            device = [
+                str(nvcc()),
+                f"-ccbin={cxx}",
+                *gencode(),
+                *COMMON_FLAGS,
+                *NVCC_FLAGS,
+                compression(),
+                host,
+                "-DUSE_CUDA",
+            ]
             self.rule(
                 "nvcc",
                 [*device, *torch_includes, "$flags", "-MD", "-MF", "$out.d", "-c", "$in", "-o", "$out"],
@@ -257,6 +272,7 @@ def parts(sources: Iterable[Path]) -> list[tuple[Path, list[str]]]:
         "gather.cu",
         "scatter.cu",
         "heat.cu",
+        "heat_advance.cu",
         "heat_operator.cu",
         "simple_steps.cu",
         "tangent_gather.cu",
@@ -362,7 +378,7 @@ class Build(build_ext):
             record["cpu"] = {"compiler": compiler, "flags": CPU_FLAGS, "isa": list(self.levels), "sanitize": sanitize}
         if "cuda" in built:
             compiler = compiler_version(str(nvcc()))
-            record["cuda"] = {"compiler": compiler, "flags": NVCC_FLAGS, "archs": cuda_archs()}
+            record["cuda"] = {"compiler": compiler, "flags": [*NVCC_FLAGS, compression()], "archs": cuda_archs()}
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(record, indent=2) + "\n")
 
