@@ -36,8 +36,8 @@ CALLS = 5
 """Profiled calls; the median is reported."""
 
 SCALARS = (
-    "index", "mass", "rest_volume", "volume", "strain_rate", "theta", "conductance", "blend", "capacity", "mean",
-    "product", "increment",
+    "index", "mass", "rest_volume", "volume", "theta", "conductance", "blend", "capacity", "mean", "product",
+    "increment",
 )  # fmt: skip
 WORDS = dict.fromkeys(SCALARS, 1) | {
     "x": D, "v": D, "gradient": D, "C": D * D, "F": D * D, "packed": D + 1, "nodes": D + 1, "updated": D + 1, "sums": 4,
@@ -132,15 +132,12 @@ KERNELS = (
     ),
     Kernel("grid update", ("next_grid_kernel",), "", "nodes updated nodes"),
     Kernel(
-        "G2P and F", ("HeatAdvanceGather",), "index x F rest_volume v C x F strain_rate volume", "updated",
-        operations=gathered(D) + MOTION + STRAIN_RATE + DETERMINANT + 1,
-    ),
-    Kernel(
-        "P2G of heat", ("HeatSource",), "index x mass strain_rate theta gradient volume conductance blend", "sums sums",
-        operations=HEAT_WEIGHTS + scattered(2, 2),
+        "G2P and P2G of heat", ("HeatAdvance",),
+        "index x F rest_volume mass theta gradient volume v C x F volume conductance blend packed",
+        "updated sums sums",
+        operations=gathered(D) + MOTION + STRAIN_RATE + DETERMINANT + 1 + HEAT_WEIGHTS + scattered(2, 2),
     ),
     Kernel("averages of the nodes", ("HeatMeansArguments",), pool="sums theta capacity mean sums product product"),
-    Kernel("packed particles", ("pack_kernel",), "index x conductance packed"),
     Kernel("products with H", ("product_kernel",), " ".join(["packed"] * STEPS), PRODUCTS, "", STEPS * applied()),
     Kernel("increments of the nodes", ("HeatFinishArguments",), "", "capacity theta product product theta increment"),
     Kernel(

@@ -23,7 +23,7 @@ struct Topology {
 
 // Cost of a particle out of its block, as a multiple of that of activating one, on CUDA. A step with heat has more
 // kernels.
-constexpr int kOutOfBlockCost = 2, kOutOfBlockCostWithHeat = 8;
+constexpr int kOutOfBlockCost = 2, kOutOfBlockCostWithHeat = 64;
 
 // Counters of the displacement of particles since their activation, which on CUDA may serve several steps.
 struct Displacement {

@@ -193,25 +193,32 @@ struct HeatSolver {
 
   // Solves the scenes for which a few steps without scalar products suffice.
   void solve_by_simple_steps() const {
-    const auto simple = [&](int scene) { return running(scene) && w.scene[scene].simple > 0; };
-    const auto twice = [&](int scene) { return running(scene) && w.scene[scene].simple > 1; };
-    bool any = false, again = false;
-    for (int scene = 0; scene < a.topology.scenes; scene++) any |= simple(scene), again |= twice(scene);
-    if (!any) return;
-    for_slots(simple, [&](int64_t, int, int64_t first) {
-      for (int64_t i = first; i < first + kBlockNodes<D>; i++) a.increment[i] = w.v.inverse[i] * w.v.r[i];
-    });
-    if (again) {  // the residual is now −H d
-      sum_to<HeatSum::product>(a.increment, w.v.product, twice, [](int, double) {});
-      for_slots(twice, [&](int64_t, int, int64_t first) {
-        for (int64_t i = first; i < first + kBlockNodes<D>; i++) {
-          a.increment[i] -= w.v.inverse[i] * w.v.product[i];
-          w.v.product[i] = T(0);
-        }
-      });
+    for (int k = 0; k < kMostSimpleSteps; k++) {
+      const auto takes = [&](int scene) { return running(scene) && w.scene[scene].simple > k; };
+      bool any = false;
+      for (int scene = 0; scene < a.topology.scenes; scene++) any |= takes(scene);
+      if (!any) break;
+      take_simple_step(k, takes);
     }
     for (int scene = 0; scene < a.topology.scenes; scene++)
-      if (simple(scene)) finish_simple_steps(a, scene, w.scene[scene]);
+      if (running(scene) && w.scene[scene].simple > 0) finish_simple_steps(a, scene, w.scene[scene]);
+  }
+
+  // Step k, after the product for the residual that the step before has left.
+  template <class Takes>
+  void take_simple_step(int k, const Takes& takes) const {
+    if (k > 0) sum_to<HeatSum::product>(w.v.p, w.v.product, takes, [](int, double) {});
+    for_slots(takes, [&](int64_t, int scene, int64_t first) {
+      const int steps = w.scene[scene].simple;
+      const double c = bound_of_scene(a, scene);
+      const T omega = T(simple_weight(steps, k, c)), before = k > 0 ? T(simple_weight(steps, k - 1, c)) : T(0);
+      for (int64_t i = first; i < first + kBlockNodes<D>; i++) {
+        w.v.r[i] = (T(1) - before) * w.v.r[i] - before * w.v.product[i];
+        w.v.p[i] = w.v.inverse[i] * w.v.r[i];
+        a.increment[i] += omega * w.v.p[i];
+        w.v.product[i] = T(0);
+      }
+    });
   }
 
   // f(scene, sum over its slots); the order of the sums does not depend on threads.
@@ -249,7 +256,7 @@ struct HeatSolver {
       w.step[slot] = sums;
     });
     for_scenes(active, w.step, StepSums<double>::zero(),
-               [&](int scene, const StepSums<double>& sums) { finish_iteration(w.scene[scene], a.method, sums); });
+               [&](int scene, const StepSums<double>& sums) { finish_iteration(a, scene, w.scene[scene], sums); });
     return true;
   }
 

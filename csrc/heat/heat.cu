@@ -208,8 +208,8 @@ struct HeatKernel {
   }
 
   // Adds a sum over particles to `out`, for active scenes; the parts of p · H p are stored.
-  template <HeatSum Sum, class Wanted>
-  __device__ void sum_to(const T* u, T* out, WarpMemory<S>& memory, const Wanted& wanted) const {
+  template <HeatSum Sum, class Values, class Wanted>
+  __device__ void sum_to(const Values& u, T* out, WarpMemory<S>& memory, const Wanted& wanted) const {
     for (int colour = a.deterministic ? 0 : -1; colour < (a.deterministic ? 1 << D : 0); colour++) {
       const int last = w.first_item[blockIdx.x + 1];
       for (int item = w.first_item[blockIdx.x], end; item < last; item = end) {
@@ -218,8 +218,7 @@ struct HeatKernel {
         if (!wanted(scene)) continue;
         Curvature sum{0};
         for_items(a.topology, item + threadIdx.x / 32, end, blockDim.x / 32, colour, [&](int number, int end) {
-          const T power =
-              sum_items<Sum, S>(a.topology, w.packed, number, end, StoredValues<T>{u}, out, a.deterministic, memory);
+          const T power = sum_items<Sum, S>(a.topology, w.packed, number, end, u, out, a.deterministic, memory);
           if (lane_index() == 0) sum.value += double(power);
         });
         if (Sum != HeatSum::product) continue;
@@ -233,17 +232,18 @@ struct HeatKernel {
   __device__ void start(WarpMemory<S>& memory) const;
   __device__ void direct(bool first) const;
   // The last of a few steps without scalar products.
-  __device__ void take_last_step(int slot, int end) const {
+  __device__ void take_last_step(const T& omega, int slot, int end) const {
     for_quads(slot, end, [&](int64_t i) {
       const Vec4<T> inverse = load_vec4(w.v.inverse + i), r = load_vec4(w.v.r + i);
       Vec4<T> increment = load_vec4(a.increment + i);
 #pragma unroll
-      for (int k = 0; k < kBlockWidth; k++) increment.e[k] += inverse.e[k] * r.e[k];
+      for (int k = 0; k < kBlockWidth; k++) increment.e[k] += omega * (inverse.e[k] * r.e[k]);
       store_vec4(a.increment + i, increment);
     });
   }
   __device__ void product(WarpMemory<S>& memory) const {
-    sum_to<HeatSum::product>(w.v.p, w.v.product, memory, [&](int scene) { return w.scene[1][scene].running; });
+    sum_to<HeatSum::product>(StoredValues<T>{w.v.p}, w.v.product, memory,
+                             [&](int scene) { return w.scene[1][scene].running; });
     wait_for_all();
   }
   __device__ void update() const;
@@ -276,11 +276,11 @@ __device__ void HeatKernel<Order, T, D>::start(WarpMemory<S>& memory) const {
   });
   cg::this_grid().sync();
   for (int64_t scene = thread; scene < t.scenes; scene += threads) lay_out_parts(int(scene));
-  if (a.theta) sum_to<HeatSum::product>(a.theta, w.v.product, memory, all);
+  if (has_theta(a)) sum_to<HeatSum::product>(StartValues<T, D>{a}, w.v.product, memory, all);
   if (a.method == HeatMethod::chebyshev)
-    sum_to<HeatSum::bound>(nullptr, w.v.weight, memory, all);
+    sum_to<HeatSum::bound>(StoredValues<T>{}, w.v.weight, memory, all);
   else
-    sum_to<HeatSum::diagonal>(nullptr, w.v.inverse, memory,
+    sum_to<HeatSum::diagonal>(StoredValues<T>{}, w.v.inverse, memory,
                               [&](int scene) { return takes(scene) && simple_steps(a, scene) == 0; });
   wait_for_all();
   for_slots([&](int scene, int slot, int end, bool) {
@@ -327,7 +327,7 @@ __device__ void HeatKernel<Order, T, D>::direct(bool first) const {
         sums = sum_of_block(sums);
         s = decide([&] {
           HeatScene next = s;
-          finish_iteration(next, a.method, sums);
+          finish_iteration(a, scene, next, sums);
           return next;
         });
         if (owner && threadIdx.x == 0 && !s.running) atomicSub(w.running, 1);
@@ -340,7 +340,7 @@ __device__ void HeatKernel<Order, T, D>::direct(bool first) const {
       if (!first && last) atomicSub(w.running, 1);
       w.scene[1][scene] = s;
     }
-    if (last) return take_last_step(slot, end);
+    if (last) return take_last_step(T(s.alpha), slot, end);
     if (!s.running) return;
     const T beta = T(s.beta), gamma = T(s.gamma);
     Curvature sum{0};

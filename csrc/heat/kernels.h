@@ -33,7 +33,7 @@ MPM_BACKEND_KERNELS(MPM_HEAT_TRANSFER_KERNELS)
 // Of one backend alone.
 #define MPM_HEAT_CPU_KERNELS(PLAIN, ORDERED, SIZE) PLAIN(heat_largest, HeatLargestArguments)
 #define MPM_HEAT_CUDA_KERNELS(PLAIN, ORDERED, SIZE) \
-  ORDERED(heat_g2p_advance, HeatAdvanceArguments)   \
+  ORDERED(heat_advance, HeatAdvanceArguments)       \
   ORDERED(heat_exchange, ScatterArguments)          \
   ORDERED(heat_simple_step, HeatSimpleArguments)    \
   PLAIN(heat_finish, HeatFinishArguments)

@@ -39,10 +39,16 @@ MPM_HD void add_term(const HeatTermArguments<T, D>& a, int64_t i) {
   at_node<heat_term<T, D>>(a.topology, a, i);
 }
 
+// The part of entry i of `count`.
+template <class T>
+MPM_HD void clear(const HeatCleared<T>& cleared, int64_t i, int64_t count) {
+  for (; i < cleared.size; i += count) cleared.memory[i] = T(0);
+}
+
 template <class T, int D>
 MPM_HD void mean_and_clear(const HeatMeansArguments<T, D>& a, int64_t i) {
   heat_mean(a, i);
-  for (int64_t k = i; k < a.cleared_size; k += a.nodes) a.cleared[k] = T(0);
+  clear(a.cleared, i, a.nodes);
 }
 
 // Work at a scene: i < scenes.
@@ -50,8 +56,7 @@ template <class T, int D>
 MPM_HD void finish_scene(const HeatFinishArguments<T, D>& a, int64_t scene) {
   constexpr double kGrowth = 2;  // of the bound, within a substep
   const HeatArguments<T, D>& solve = a.simple.solve;
-  const double bound = solve.bound_scale * solve.scene_bound[scene];
-  if (a.displacement && simple_steps_of(kGrowth * bound, solve.relative_tolerance) == 0)
+  if (a.displacement && simple_steps_of(kGrowth * bound_of_scene(solve, int(scene)), solve.relative_tolerance) == 0)
     request_activation(a.displacement);
   if (simple_steps(solve, int(scene)) == 0)
     count_solve(
@@ -63,7 +68,9 @@ template <class T, int D>
 MPM_HD void finish(const HeatFinishArguments<T, D>& a, int64_t i) {
   const Topology<T, D>& t = a.simple.solve.topology;
   if (i < t.scenes) finish_scene(a, i);
-  if (i < nodes_of(t)) at_node<finish_node<T, D>>(t, a, i);
+  if (i >= nodes_of(t)) return;
+  at_node<finish_node<T, D>>(t, a, i);
+  clear(a.cleared, i, nodes_of(t));
 }
 
 }  // namespace

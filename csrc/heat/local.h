@@ -84,10 +84,10 @@ template <class T, int D>
 MPM_HD void heat_mean(const HeatMeansArguments<T, D>& a, int64_t i) {
   T* const sum = a.sums + i * kHeatChannels;
   const T capacity = sum[kHeatCapacity], varying = sum[kHeatVarying];
-  const T theta = capacity > T(0) ? sum[kHeatTheta] / capacity : T(0);
+  const T theta = mean_of(sum[kHeatTheta], capacity);
   a.theta[i] = theta;
   a.capacity[i] = capacity;
-  sum[kHeatMean] = varying > T(0) ? sum[kHeatMean] / varying : T(0);
+  sum[kHeatMean] = mean_of(sum[kHeatMean], varying);
   if (!a.start) return;
   a.start[i] = theta;
   a.fixed[i] = false;
@@ -106,12 +106,16 @@ MPM_HD void finish_node(const HeatFinishArguments<T, D>& a, int scene, int64_t i
   T increment = T(0);
   if (steps > 0) {
     const double dt = step_of_scene(solve, scene);
-    increment = simple_increment(a.simple, i, steps, dt);
+    increment = simple_increment(a.simple, i, steps, bound_of_scene(solve, scene), dt);
     if (dt < 0 || !(increment - increment == T(0))) report_unsolved(a.status + scene * kHeatStatusSize);
-  } else if (solve.heat_capacity[i] > T(0)) {  // the solver has no results of blocks without particles
+  } else if (capacity_at(solve, i) > T(0)) {  // the solver has no results of blocks without particles
     increment = solve.increment[i];
   }
-  a.sums[i * kHeatChannels + kHeatTheta] = increment + (solve.theta[i] - a.theta[i]);
+  if (a.increment) a.increment[i] = increment;
+  if (!a.sums) return;
+  T* const sum = a.sums + i * kHeatChannels;
+  sum[kHeatTheta] = solve.sums ? increment : increment + (solve.theta[i] - a.theta[i]);
+  if (solve.sums) sum[kHeatMean] = mean_of(sum[kHeatMean], sum[kHeatVarying]);
 }
 
 template <class T, int D>

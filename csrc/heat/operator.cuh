@@ -1,9 +1,12 @@
 #pragma once
 
+#include <utility>
+
 #include "cuda/base_block.cuh"
 #include "cuda/columns.cuh"
 #include "cuda/vec4.cuh"
 #include "heat/cell.h"
+#include "heat/solve.h"
 #include "heat/sums.cuh"
 
 // The heat operator H, applied by warps, one item of particles each. A lane processes a cell: it holds the differences
@@ -77,6 +80,24 @@ struct PackedItems {
     counts = reinterpret_cast<uint16_t*>(take(items * kBlockNodes<D> * sizeof(uint16_t)));
   }
 };
+
+// Those of the simple steps come first in the work space of a solve, as in csrc/heat/heat.cu.
+template <class T, int D>
+PackedItems<T, D> packed_in(void* workspace, const Topology<T, D>& t) {
+  PackedItems<T, D> packed;
+  char* next = static_cast<char*>(workspace);
+  packed.lay_out(t, [&](int64_t bytes) { return std::exchange(next, next + align_workspace(bytes)); });
+  return packed;
+}
+
+// A particle out of its base block, in the form of a packed one.
+template <class T, int D>
+__device__ PackedParticle<T, D> packed_out_of_block(int particle, const T& conductance) {
+  PackedParticle<T, D> q{};
+  reinterpret_cast<int&>(q.f[0]) = particle;
+  q.conductance = conductance;
+  return q;
+}
 
 // Particles of its cell that a lane processes in each part of a block.
 template <class S>
@@ -261,6 +282,23 @@ template <class T>
 struct StoredValues {
   const T* u;
   __device__ Vec4<T> at(int node) const { return load_vec4(u + node); }
+};
+
+// Those at the start of a solve.
+template <class T, int D>
+struct StartValues {
+  const HeatArguments<T, D>& a;
+  __device__ Vec4<T> at(int node) const {
+    if (a.theta) return load_vec4(a.theta + node);
+    static_assert(kHeatChannels == 4);
+    Vec4<T> u;
+#pragma unroll
+    for (int k = 0; k < kBlockWidth; k++) {
+      const Vec4<T> sum = load_vec4(a.sums + int64_t(node + k) * kHeatChannels);
+      u.e[k] = mean_of(sum.e[kHeatTheta], sum.e[kHeatCapacity]);
+    }
+    return u;
+  }
 };
 
 // Adds a sum over the packed particles of the items [number, end), which are of one base block, or of one part of it,

@@ -256,7 +256,7 @@ struct SceneSolver {
     };
     for_particles([&](int, const int* base) { include(base, Order + 1); });
     for_rows([&](int row) {
-      if (k.a.heat_capacity[row] <= T(0)) return;
+      if (capacity_at(k.a, row) <= T(0)) return;
       int node[D];
       node_of_row(row, node);
       include(node, 1);
@@ -407,12 +407,12 @@ struct SceneSolver {
   __device__ void start() {
     const HeatArguments<T, D>& a = k.a;
     for_nodes([&](int i) {
-      const int row = a.theta ? row_of(i) : -1;
-      p[i] = row < 0 ? T(0) : a.theta[row];
+      const int row = has_theta(a) ? row_of(i) : -1;
+      p[i] = row < 0 ? T(0) : theta_at(a, row);
       product[i] = T(0);
     });
     __syncthreads();
-    if (a.theta) sum_cells<HeatSum::product>(p, product);
+    if (has_theta(a)) sum_cells<HeatSum::product>(p, product);
     for_nodes([&](int i) { p[i] = T(0); });
     __syncthreads();
     const bool chebyshev = a.method == HeatMethod::chebyshev;
@@ -436,7 +436,8 @@ struct SceneSolver {
 
   // The last of a few steps without scalar products.
   __device__ void take_last_step() const {
-    for_nodes([&](int i) { d[i] += v.inverse[i] * v.r[i]; });
+    const T omega = T(s.scene.alpha);
+    for_nodes([&](int i) { d[i] += omega * (v.inverse[i] * v.r[i]); });
     __syncthreads();  // all have read the scene
     if (threadIdx.x == 0) finish_simple_steps(k.a, scene, s.scene);
     __syncthreads();
@@ -461,7 +462,7 @@ struct SceneSolver {
     for_nodes([&](int i) { sums.add(update_node(v, d, i, alpha)); });
     if (wants_sums(s.scene, method)) sums = sum_of_block(sums);
     __syncthreads();  // all have read the scene
-    if (threadIdx.x == 0) finish_iteration(s.scene, method, sums);
+    if (threadIdx.x == 0) finish_iteration(k.a, scene, s.scene, sums);
     __syncthreads();
   }
 

@@ -1,5 +1,3 @@
-#include <utility>
-
 #include "cuda/launch.cuh"
 #include "cuda/programmatic_launch.cuh"
 #include "heat/kernels.h"
@@ -24,29 +22,15 @@ struct SimpleKernel {
   Columns<const T, 1> conductance;
   int warps_of_item;  // in a product: one, or one for each part of a block
 
-  // The packed particles come first in the work space, as in that of csrc/heat/heat.cu.
-  explicit SimpleKernel(const HeatSimpleArguments<T, D>& a) : a(a), x(a.solve.x), conductance(a.solve.conductance) {
-    char* next = static_cast<char*>(a.solve.workspace);
-    packed.lay_out(a.solve.topology, [&](int64_t bytes) { return std::exchange(next, next + align_workspace(bytes)); });
-  }
+  explicit SimpleKernel(const HeatSimpleArguments<T, D>& a)
+      : a(a), packed(packed_in(a.solve.workspace, a.solve.topology)), x(a.solve.x), conductance(a.solve.conductance) {}
 
   __device__ const Topology<T, D>& topology() const { return a.solve.topology; }
   __device__ Item item(int i) const { return reinterpret_cast<const Item*>(schedule_of(topology()).items)[i]; }
   __device__ int items() const { return *schedule_of(topology()).item_count; }
-  __device__ bool takes(const Item& item) const {
-    return simple_steps(a.solve, scene_of(topology(), item.block)) > a.step;
-  }
+  __device__ int steps_of(const Item& item) const { return simple_steps(a.solve, scene_of(topology(), item.block)); }
   __device__ T* product() const { return a.product[a.step]; }
 };
-
-// A particle out of its base block, in the form of a packed one.
-template <class T, int D>
-__device__ PackedParticle<T, D> out_of_block(int particle, const T& conductance) {
-  PackedParticle<T, D> q{};
-  reinterpret_cast<int&>(q.f[0]) = particle;
-  q.conductance = conductance;
-  return q;
-}
 
 template <int Order, class T, int D>
 __global__ void __launch_bounds__(kPackThreads) pack_kernel(const __grid_constant__ SimpleKernel<Order, T, D> k) {
@@ -58,7 +42,7 @@ __global__ void __launch_bounds__(kPackThreads) pack_kernel(const __grid_constan
   const int count = k.items();
   for (int i = blockIdx.x; i < count; i += gridDim.x) {
     const Item item = k.item(i);
-    if (!k.takes(item)) continue;
+    if (k.steps_of(item) == 0) continue;
     int particle[kEachPacked], cell[kEachPacked], rank[kEachPacked];
     PackedParticle<T, D> q[kEachPacked];
     Vector<T, D> x[kEachPacked];
@@ -91,22 +75,26 @@ __global__ void __launch_bounds__(kPackThreads) pack_kernel(const __grid_constan
       if (cell[n] < S::cells)
         to[item.begin + m.place(cell[n], rank[n])] = q[n];
       else
-        to[item.end - 1 - rank[n]] = out_of_block<T, D>(particle[n], q[n].conductance);
+        to[item.end - 1 - rank[n]] = packed_out_of_block<T, D>(particle[n], q[n].conductance);
     }
     __syncthreads();
   }
 }
 
-// Directions of the second step, from the first product.
+// Directions of a step of a scene.
 template <class T, int D>
-struct SecondDirections {
+struct Directions {
   const HeatSimpleArguments<T, D>& a;
-  const double dt;
+  int steps;
+  double c, dt;
 
+  __device__ Directions(const HeatSimpleArguments<T, D>& a, int scene, int steps)
+      : a(a), steps(steps), c(bound_of_scene(a.solve, scene)), dt(step_of_scene(a.solve, scene)) {}
+  __device__ T of(int64_t node) const { return simple_direction(a, node, steps, c, dt); }
   __device__ Vec4<T> at(int node) const {
     Vec4<T> u;
 #pragma unroll
-    for (int k = 0; k < kBlockWidth; k++) u.e[k] = simple_direction(a, node + k, dt);
+    for (int k = 0; k < kBlockWidth; k++) u.e[k] = of(node + k);
     return u;
   }
 };
@@ -150,7 +138,7 @@ struct WarpAddition {
   using Nodes = LaneNodes<Order, T, D>;
   static constexpr int together = Nodes::each == 1 ? 4 : 1;  // whose loads do not wait for each other
   const SimpleKernel<Order, T, D>& k;
-  const double dt;
+  const Directions<T, D>& directions;
   // Of the particle of this lane.
   int slot = -1, base[D] = {};
   T f[D] = {}, conductance = T(0);
@@ -179,8 +167,7 @@ struct WarpAddition {
       nodes[n] = nodes_of(lane);
       lanes &= lanes - 1;
 #pragma unroll
-      for (int e = 0; e < Nodes::each; e++)
-        u[n][e] = nodes[n].row[e] < 0 ? T(0) : simple_direction(k.a, nodes[n].row[e], dt);
+      for (int e = 0; e < Nodes::each; e++) u[n][e] = nodes[n].row[e] < 0 ? T(0) : directions.of(nodes[n].row[e]);
     }
 #pragma unroll
     for (int n = 0; n < together; n++) add(nodes[n], u[n], of[n]);
@@ -208,14 +195,16 @@ struct WarpAddition {
   }
 };
 
-// Adds the particles [first, end) of the packed ones, which have left their base block. Each lane finds one, so that
-// its loads do not wait for those of others.
+// Adds every `stride`-th of the packed particles [first, end), which have left their base block. Each lane finds one,
+// so that its loads do not wait for those of others.
 template <int Order, class T, int D>
-__device__ void add_out_of_block(const SimpleKernel<Order, T, D>& k, int first, int end, int scene, double dt) {
-  for (int start = first; start < end; start += 32) {
-    WarpAddition<Order, T, D> warp{k, dt};
-    if (start + lane_index() < end) {
-      const PackedParticle<T, D> q = k.packed.particles[start + lane_index()];
+__device__ void add_out_of_block(const SimpleKernel<Order, T, D>& k, int first, int end, int stride, int scene,
+                                 const Directions<T, D>& directions) {
+  for (int start = first; start < end; start += 32 * stride) {
+    WarpAddition<Order, T, D> warp{k, directions};
+    const int i = start + lane_index() * stride;
+    if (i < end) {
+      const PackedParticle<T, D> q = k.packed.particles[i];
       const Vector<T, D> x = read_vector(k.x, reinterpret_cast<const int&>(q.f[0]));
       warp.slot = locate_slot<Order>(k.topology(), scene, x, warp.base, warp.f);
       warp.conductance = q.conductance;
@@ -237,24 +226,24 @@ __global__ void __launch_bounds__(kProductThreads, kProductBlocks<Order, T>)
   WarpMemory<S>& own = memory[threadIdx.x / 32];
   const Topology<T, D>& t = k.topology();
   constexpr int warps = kProductThreads / 32;
+  if (t.scenes == 1 && simple_steps(k.a.solve, 0) <= k.a.step) return;
   const int each = k.warps_of_item, count = k.items() * each;
   for (int n = int(blockIdx.x) * warps + int(threadIdx.x) / 32; n < count; n += gridDim.x * warps) {
-    const int i = n / each, part = each > 1 ? n % each : -1;
+    const int i = n / each, part = n % each;
     const Item item = k.item(i);
-    if (!k.takes(item)) continue;
-    const int scene = scene_of(t, item.block);
-    const double dt = step_of_scene(k.a.solve, scene);
+    const int steps = k.steps_of(item);
+    if (steps <= k.a.step) continue;
+    const int scene = scene_of(t, item.block), only = each > 1 ? part : -1;
+    const Directions<T, D> directions(k.a, scene, steps);
     if (k.a.step == 0)
-      sum_items<HeatSum::product, S>(t, k.packed, i, i + 1, StoredValues<T>{k.a.solve.theta}, k.product(), false, own,
-                                     part);
+      sum_items<HeatSum::product, S>(t, k.packed, i, i + 1, StartValues<T, D>{k.a.solve}, k.product(), false, own,
+                                     only);
     else
-      sum_items<HeatSum::product, S>(t, k.packed, i, i + 1, SecondDirections<T, D>{k.a, dt}, k.product(), false, own,
-                                     part);
-    if (part > 0) continue;
+      sum_items<HeatSum::product, S>(t, k.packed, i, i + 1, directions, k.product(), false, own, only);
     int in_block = 0;
     for (int c = lane_index(); c < S::cells; c += 32) in_block += k.packed.counts[int64_t(i) * S::cells + c];
     in_block = __reduce_add_sync(~0u, in_block);
-    add_out_of_block(k, item.begin + in_block, item.end, scene, dt);
+    add_out_of_block(k, item.begin + in_block + part, item.end, each, scene, directions);
     __syncwarp();
   }
 }
@@ -268,8 +257,11 @@ void heat_simple_step(const HeatSimpleArguments<T, D>& a, Stream stream) {
   kernel.warps_of_item = a.solve.topology.particles < few ? HeatShape<Order, T, D>::parts : 1;
   const int64_t items = most_items(a.solve.topology.max_blocks, a.solve.topology.particles);
   if (items == 0) return;
-  if (a.step == 0) launch_in_chain(pack_kernel<Order, T, D>, grid_size(items), kPackThreads, 0, stream, kernel);
-  launch_in_chain(product_kernel<Order, T, D>, grid_size(items * kernel.warps_of_item / (kProductThreads / 32) + 1),
+  if (!a.packed) launch_in_chain(pack_kernel<Order, T, D>, grid_size(items), kPackThreads, 0, stream, kernel);
+  // Few scenes need the last step. All blocks would cost time even so.
+  const unsigned blocks = grid_size(items * kernel.warps_of_item / (kProductThreads / 32) + 1);
+  const unsigned few_blocks = 2 * device_attribute(cudaDevAttrMultiProcessorCount);
+  launch_in_chain(product_kernel<Order, T, D>, a.step + 1 < kMostSimpleSteps ? blocks : std::min(blocks, few_blocks),
                   kProductThreads, 0, stream, kernel);
 }
 

@@ -18,7 +18,10 @@ enum class HeatMethod { conjugate_gradients, chebyshev };
 // Residual [K] that a solve may always leave, NEGLIGIBLE in torch_mpm/heat/heat.py.
 constexpr double kNegligibleResidual = 1e-12;
 
-constexpr int kMostSimpleSteps = 2;
+constexpr int kMostSimpleSteps = 3;
+
+// Sums of a node with w = N m C: w, w β, w θ and w β θ. The last two become the increment of θ and the average θ̄.
+enum HeatChannel : int { kHeatCapacity, kHeatVarying, kHeatTheta, kHeatMean, kHeatChannels };
 
 template <class T, int D>
 struct HeatArguments {
@@ -28,6 +31,7 @@ struct HeatArguments {
   Field<const T> x, conductance;       // conductance κ V [P]
   const T* heat_capacity = nullptr;    // [N], as those below
   const T* theta = nullptr;            // absent: zero
+  const T* sums = nullptr;             // on CUDA, in place of these two: [N, kHeatChannels] before any change
   const T* source = nullptr;           // absent: zero
   const T* exchange = nullptr;         // absent: zero
   const bool* fixed = nullptr;         // absent: none
@@ -55,8 +59,9 @@ struct HeatArguments {
 template <class T, int D>
 struct HeatSimpleArguments {
   HeatArguments<T, D> solve;       // its increments are those of the other scenes
-  T* product[kMostSimpleSteps]{};  // [N] H θ, and H d after the first step; zero on entry
+  T* product[kMostSimpleSteps]{};  // [N] H θ, and H (M/dt + X)⁻¹ r after each step but the last; zero on entry
   int step = 0;                    // number of the product
+  bool packed = false;             // whether the particles are in the work space already
 };
 
 // H u, or the diagonal of H where u is absent.
@@ -136,15 +141,41 @@ MPM_HD double step_of_scene(const HeatArguments<T, D>& a, int scene) {
   return a.scene_dt ? a.dt * double(a.scene_dt[scene]) : a.dt;
 }
 
-// Those for a bound c and a tolerance of the residual.
-MPM_HD int simple_steps_of(double c, double tolerance) { return c <= tolerance ? 1 : c * c <= tolerance ? 2 : 0; }
+// The simple steps d += ω_k (M/dt + X)⁻¹ r. The spectrum of (M/dt + X)⁻¹ A is that of 1 + λ, 0 ≤ λ ≤ c. The first step
+// has ω = 1, so that no residual remains where λ = 0 and the energy is conserved; each step then multiplies the
+// residual by (μ − λ)/(1 + μ) for ω = 1/(1 + μ). The products of λ and these factors are smallest on [0, c] for the
+// roots of Chebyshev's polynomials, of which the first lies at 0 and the last extremum at c. With the roots cos(π (2 k
+// + 1)/(2 n)) of n steps moved to 0 and above, h = c / (1 + cos(π/(2 n))) is half of their interval, and the product is
+// hⁿ 2^(1 − n) at most.
+MPM_HD double simple_reduction(int steps, double c) {
+  return steps == 1 ? c : steps == 2 ? 0.1715728752538099 * c * c : 0.038475772933681186 * c * c * c;
+}
 
-// Number of steps d += (M/dt + X)⁻¹ r that a known bound c of the spectrum shows to suffice, since each multiplies the
-// residual by c at most; zero where it is unknown or too large. Such scenes need no diagonal and no scalar products.
+// ω of step k; μ = h (cos(π/(2 n)) − root).
+template <class T>
+MPM_HD T simple_weight(int steps, int k, const T& c) {
+  const double root = k == 0 ? 0 : steps == 2 ? 0.8284271247461901 : k == 1 ? 0.9282032302755092 : 0.46410161513775455;
+  return T(1) / (T(1) + T(root) * c);
+}
+
+// Those for a bound c and a tolerance of the residual.
+MPM_HD int simple_steps_of(double c, double tolerance) {
+  for (int steps = 1; steps <= kMostSimpleSteps; steps++)
+    if (simple_reduction(steps, c) <= tolerance) return steps;
+  return 0;
+}
+
+template <class T, int D>
+MPM_HD double bound_of_scene(const HeatArguments<T, D>& a, int scene) {
+  return a.bound_scale * a.scene_bound[scene];
+}
+
+// Number of simple steps that a known bound c of the spectrum shows to suffice; zero where it is unknown or too large.
+// Such scenes need no diagonal and no scalar products.
 template <class T, int D>
 MPM_HD int simple_steps(const HeatArguments<T, D>& a, int scene) {
   if (!a.scene_bound || scene < 0 || a.method != HeatMethod::conjugate_gradients) return 0;
-  return simple_steps_of(a.bound_scale * a.scene_bound[scene], a.relative_tolerance);
+  return simple_steps_of(bound_of_scene(a, scene), a.relative_tolerance);
 }
 
 // Whether the next step is the last one of them: it needs neither H p nor the residual.
@@ -155,12 +186,31 @@ MPM_HD bool is_last_simple_step(const HeatScene& s) {
 // After it. These steps conserve the energy.
 template <class T, int D>
 MPM_HD void finish_simple_steps(const HeatArguments<T, D>& a, int scene, HeatScene& s) {
-  const double c = a.bound_scale * a.scene_bound[scene];
-  s.residual *= s.simple == 1 ? c : c * c;
+  s.residual *= simple_reduction(s.simple, bound_of_scene(a, scene));
   s.iterations = s.simple;
   s.heat = s.dt * s.source;
   s.converged = true;
   s.running = false;
+}
+
+template <class T>
+MPM_HD T mean_of(const T& sum, const T& weight) {
+  return weight > T(0) ? sum / weight : T(0);
+}
+
+template <class T, int D>
+MPM_HD T capacity_at(const HeatArguments<T, D>& a, int64_t row) {
+  return a.sums ? a.sums[row * kHeatChannels + kHeatCapacity] : a.heat_capacity[row];
+}
+
+template <class T, int D>
+MPM_HD bool has_theta(const HeatArguments<T, D>& a) {
+  return a.sums || a.theta;
+}
+template <class T, int D>
+MPM_HD T theta_at(const HeatArguments<T, D>& a, int64_t row) {
+  if (a.theta) return a.theta[row];
+  return mean_of(a.sums[row * kHeatChannels + kHeatTheta], capacity_at(a, row));
 }
 
 // The equation of a node at the start, where `product` is H θ. Nodes that are not free have no weight and no residual.
@@ -172,13 +222,13 @@ struct NodeEquation {
 
 template <class T, int D>
 MPM_HD NodeEquation<T> node_equation(const HeatArguments<T, D>& a, int64_t row, const T& product, double dt) {
-  const T mass = a.heat_capacity[row], exchange = a.exchange ? a.exchange[row] : T(0);
+  const T mass = capacity_at(a, row), exchange = a.exchange ? a.exchange[row] : T(0);
   const bool material = !(mass <= T(0)), held = material && a.fixed && a.fixed[row], free = material && !held;
   NodeEquation<T> e{free, held || (free && exchange != T(0)), mass, a.source ? a.source[row] : T(0), T(0), T(0)};
   if (!free) return e;
   e.weight = mass / T(dt) + exchange;
   e.residual = e.source - product;
-  if (a.theta) e.residual -= exchange * a.theta[row];
+  if (a.exchange && has_theta(a)) e.residual -= exchange * theta_at(a, row);
   return e;
 }
 
@@ -207,20 +257,38 @@ MPM_HD StartSums<T> start_node(const HeatArguments<T, D>& a, const HeatVectors<T
   return sums;
 }
 
-// The values u of a product H u of the simple steps.
+// The residual of a node before step k of the simple steps of a scene, and the increment so far.
+template <class T>
+struct SimpleNode {
+  T residual, increment, weight;  // M/dt + X, zero where the node is not free
+};
+
 template <class T, int D>
-MPM_HD T simple_direction(const HeatSimpleArguments<T, D>& a, int64_t row, double dt) {
-  if (a.step == 0) return a.solve.theta[row];
+MPM_HD SimpleNode<T> simple_node(const HeatSimpleArguments<T, D>& a, int64_t row, int steps, int k, double c,
+                                 double dt) {
   const NodeEquation<T> e = node_equation(a.solve, row, a.product[0][row], dt);
-  return e.free ? e.residual / e.weight : T(0);
+  SimpleNode<T> n{e.residual, T(0), e.weight};
+  if (!e.free) return n;
+  for (int j = 0; j < k; j++) {
+    const T omega = simple_weight(steps, j, T(c));
+    n.increment += omega * (n.residual / e.weight);
+    if (j + 1 < steps) n.residual = (T(1) - omega) * n.residual - omega * a.product[j + 1][row];
+  }
+  return n;
 }
 
-// The increment of a node after these steps. The second residual is −H d.
+// The values u of a product H u of the simple steps.
 template <class T, int D>
-MPM_HD T simple_increment(const HeatSimpleArguments<T, D>& a, int64_t row, int steps, double dt) {
-  const NodeEquation<T> e = node_equation(a.solve, row, a.product[0][row], dt);
-  if (!e.free) return T(0);
-  return (steps > 1 ? e.residual - a.product[1][row] : e.residual) / e.weight;
+MPM_HD T simple_direction(const HeatSimpleArguments<T, D>& a, int64_t row, int steps, double c, double dt) {
+  if (a.step == 0) return theta_at(a.solve, row);
+  const SimpleNode<T> n = simple_node(a, row, steps, a.step - 1, c, dt);
+  return n.weight == T(0) ? T(0) : n.residual / n.weight;
+}
+
+// The increment of a node after these steps.
+template <class T, int D>
+MPM_HD T simple_increment(const HeatSimpleArguments<T, D>& a, int64_t row, int steps, double c, double dt) {
+  return simple_node(a, row, steps, steps, c, dt).increment;
 }
 
 // Next direction; returns the part of p · A p without H.
@@ -313,8 +381,9 @@ MPM_HD bool wants_sums(const HeatScene& s, HeatMethod method) {
   return s.simple == 0 && (method != HeatMethod::chebyshev || s.iterations + 1 >= s.most);
 }
 
-MPM_HD void finish_iteration(HeatScene& s, HeatMethod method, const StepSums<double>& sums) {
-  const bool known = wants_sums(s, method);
+template <class T, int D>
+MPM_HD void finish_iteration(const HeatArguments<T, D>& a, int scene, HeatScene& s, const StepSums<double>& sums) {
+  const bool known = wants_sums(s, a.method);
   s.iterations++;
   if (known) {
     s.residual = residual_in_kelvin(s, sums.residual);
@@ -322,8 +391,11 @@ MPM_HD void finish_iteration(HeatScene& s, HeatMethod method, const StepSums<dou
     s.converged = s.residual <= s.tolerance;
     s.running = s.residual > s.tolerance && s.iterations < s.most;
   }
-  if (s.simple > 0) return;
-  if (method == HeatMethod::chebyshev) return direct_chebyshev(s);
+  if (s.simple > 0) {
+    s.alpha = simple_weight(s.simple, s.iterations, bound_of_scene(a, scene));
+    return;
+  }
+  if (a.method == HeatMethod::chebyshev) return direct_chebyshev(s);
   s.beta = sums.preconditioned / s.preconditioned;
   s.preconditioned = sums.preconditioned;
 }

@@ -4,13 +4,11 @@
 #include "grid/obstacle.h"
 #include "grid/topology.h"
 #include "heat/solve.h"
+#include "transfer/advance.h"
 
 // Transfer of temperature between particles and nodes in a rollout. The particles of the call are those of its P2G and
 // G2P, with the same activation.
 namespace mpm {
-
-// Sums of a node with w = N m C: w, w β, w θ and w β θ. The last two become the increment of θ and the average θ̄.
-enum HeatChannel : int { kHeatCapacity, kHeatVarying, kHeatTheta, kHeatMean, kHeatChannels };
 
 // Columns of the status of a scene.
 enum HeatStatus : int { kUnsolved, kLargestResidual, kLargestFront, kHeatStatusSize };
@@ -50,10 +48,27 @@ struct HeatToNodesArguments {
   Field<const T> scene_dt;
   double dt = 0;
   bool deterministic = false;
-  Field<const T> strain_rate;           // on CUDA, where G2P stores it
   Field<T> conductance, blend, number;  // results per particle; the number may be absent on CUDA
   double* largest = nullptr;            // on CUDA: [scenes], raised to the largest number of a particle
   NodeField<T> sums;                    // kHeatChannels, zero on entry
+};
+
+// G2P of the motion and P2G of heat in one pass over the particles, on CUDA. It also stores the volumes after the step,
+// and packs the particles for the products of the simple steps where there is a work space.
+template <class T, int D>
+struct HeatAdvanceArguments {
+  G2PAdvanceArguments<T, D> advance;
+  HeatToNodesArguments<T, D> to_nodes;
+  Field<const T> rest;
+  Field<T> volume_next;
+  void* workspace = nullptr;  // of the solve; may be absent
+};
+
+// On CUDA: other memory, which is set to zero for the next substep.
+template <class T>
+struct HeatCleared {
+  T* memory = nullptr;
+  int64_t size = 0;
 };
 
 // Averages of the nodes from their sums: θ, its heat capacity, and θ̄, which replaces w β θ. Where nodes may be held,
@@ -66,8 +81,7 @@ struct HeatMeansArguments {
   T* capacity = nullptr;
   T* start = nullptr;  // may be absent, and `fixed` with it
   bool* fixed = nullptr;
-  T* cleared = nullptr;  // on CUDA: other memory, which is set to zero for the next substep
-  int64_t cleared_size = 0;
+  HeatCleared<T> cleared;
 };
 
 // Replaces w θ in the sums by the change of the temperatures: the increments of the solve, from `start` on, which
@@ -162,13 +176,15 @@ struct HeatTermArguments {
   T* source = nullptr;
 };
 
-// The increments of all nodes, in place of w θ in their sums: those of simple steps, and those of the solve for the
-// other scenes, whose solves are added to the status.
+// The increments of all nodes: those of simple steps, and those of the solve for the other scenes, whose solves are
+// added to the status. With a solve that reads the sums, the averages θ̄ too.
 template <class T, int D>
 struct HeatFinishArguments {
   HeatSimpleArguments<T, D> simple;
   const T* theta = nullptr;  // averages of the nodes
-  T* sums = nullptr;
+  T* sums = nullptr;         // where w θ is replaced by the change of the temperature; may be absent
+  T* increment = nullptr;    // may be absent
+  HeatCleared<T> cleared;
   double* status = nullptr;              // [scenes, kHeatStatusSize]
   Displacement* displacement = nullptr;  // requests an activation where a scene may soon need more; may be absent
 };

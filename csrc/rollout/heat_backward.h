@@ -32,6 +32,7 @@ class HeatBackward {
     backend::heat_to_particles_backward(order(), up, stream_);
     scatter(up);
     solve(solution.system, adjoints.status);
+    multiply(solution.system);
     if (heat().has_terms()) adjoint_of_terms(solution);
     if (adjoints.boundaries.defined()) adjoint_of_boundaries(solution, adjoints.boundaries);
     adjoint_of_nodes(solution, adjoints.dt.defined());
@@ -56,6 +57,8 @@ class HeatBackward {
   HeatToParticlesBackwardArguments<T, D> to_particles(const HeatSolution<T, D>& solution, const HeatAdjoints& adjoints);
   void scatter(const HeatToParticlesBackwardArguments<T, D>& up);
   void solve(HeatArguments<T, D> system, const Tensor& status);
+  void solve_by_simple_steps(const HeatArguments<T, D>& system, double* counts);
+  void multiply(const HeatArguments<T, D>& system);
   HeatTermBackwardArguments<T, D> term_backward(const HeatSolution<T, D>& solution,
                                                 const HeatTermArguments<T, D>& term) const;
   void adjoint_of_terms(const HeatSolution<T, D>& solution);
@@ -73,7 +76,7 @@ class HeatBackward {
   backend::Stream stream_;
   Tensor value_, moment_, blend_, rate_of_particles_;  // [P, kHeatForms], [P, kHeatForms, D], [P], [P, 1]
   int64_t nodes_ = -1;
-  Tensor adjoints_, source_, multiplier_, product_, forms_, rate_;  // of the nodes
+  Tensor adjoints_, source_, multiplier_, product_, products_, forms_, rate_;  // of the nodes
   Tensor slot_sums_, counted_;  // of the numbers of the boundary, by slots; nodes that are held
   // Adjoints of the sums of the free surface, and of θ by the terms; [P, 1 + D], [P, 1 + D, D].
   Tensor surface_, by_terms_, surface_value_, surface_gradient_;
@@ -113,6 +116,7 @@ void HeatBackward<T, D>::make_nodes(const HeatSolution<T, D>& solution) {
   nodes_ = nodes;
   for (Tensor* t : {&source_, &multiplier_, &product_, &rate_}) *t = empty(in_.x, {nodes});
   adjoints_ = empty(in_.x, {nodes, 2});
+  if (MPM_BACKEND == MPM_BACKEND_IS_cuda) products_ = empty(in_.x, {kMostSimpleSteps, nodes});
   forms_ = empty(in_.x, {nodes, kHeatForms});
   if (heat().holds_surface()) layer_ = empty(in_.x, {nodes});
   if (heat().has_terms()) surface_ = empty(in_.x, {nodes, kHeatChannels}), by_terms_ = empty(in_.x, {nodes});
@@ -151,7 +155,7 @@ void HeatBackward<T, D>::scatter(const HeatToParticlesBackwardArguments<T, D>& u
   torch::stable::copy_(source_, torch::stable::select(adjoints_, 1, 0));
 }
 
-// λ of A λ = adjoint of the increment, and H λ.
+// λ of A λ = adjoint of the increment.
 template <class T, int D>
 void HeatBackward<T, D>::solve(HeatArguments<T, D> system, const Tensor& status) {
   system.theta = nullptr;
@@ -164,11 +168,32 @@ void HeatBackward<T, D>::solve(HeatArguments<T, D> system, const Tensor& status)
   system.converged = static_cast<bool*>(converged_.data_ptr());
   if (!workspace_.defined()) workspace_ = empty(in_.x, {backend::heat_workspace(system, stream_)}, ScalarType::Byte);
   system.workspace = workspace_.data_ptr();
+  double* const counts = static_cast<double*>(status.data_ptr());
+#if MPM_BACKEND == MPM_BACKEND_IS_cuda
+  if (!system.deterministic) return solve_by_simple_steps(system, counts);
+#endif
   backend::heat_cg(order(), system, stream_);
-  backend::heat_count(HeatCountArguments<T, D>{in_.scenes, system.converged, system.residual, system.scene_dt,
-                                               static_cast<double*>(status.data_ptr())},
+  backend::heat_count(HeatCountArguments<T, D>{in_.scenes, system.converged, system.residual, system.scene_dt, counts},
                       stream_);
+}
 
+template <class T, int D>
+void HeatBackward<T, D>::solve_by_simple_steps([[maybe_unused]] const HeatArguments<T, D>& system,
+                                               [[maybe_unused]] double* counts) {
+#if MPM_BACKEND == MPM_BACKEND_IS_cuda
+  backend::clear(products_, stream_);
+  HeatFinishArguments<T, D> finish;
+  finish.simple.solve = system;
+  for (int k = 0; k < kMostSimpleSteps; k++) finish.simple.product[k] = rows(products_) + k * nodes_;
+  finish.increment = system.increment;
+  finish.status = counts;
+  solve_simply(order(), finish, stream_);
+#endif
+}
+
+// H λ.
+template <class T, int D>
+void HeatBackward<T, D>::multiply(const HeatArguments<T, D>& system) {
   backend::clear(product_, stream_);
   HeatOperatorArguments<T, D> a;
   a.topology = system.topology;

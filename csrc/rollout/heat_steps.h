@@ -1,5 +1,7 @@
 #pragma once
 
+#include <algorithm>
+#include <iterator>
 #include <optional>
 
 #include "heat/kernels.h"
@@ -17,6 +19,21 @@ struct HeatSolution {
   HeatArguments<T, D> system;
   const T* theta;  // averages of the nodes [N]
 };
+
+#if MPM_BACKEND == MPM_BACKEND_IS_cuda
+// Solves by simple steps where these suffice, and the other scenes by conjugate gradients.
+template <class T, int D>
+void solve_simply(int64_t order, HeatFinishArguments<T, D>& a, backend::Stream stream) {
+  HeatSimpleArguments<T, D>& simple = a.simple;
+  simple.solve.leaves_simple = true;
+  for (simple.step = has_theta(simple.solve) ? 0 : 1; simple.step < kMostSimpleSteps; simple.step++) {
+    backend::heat_simple_step(order, simple, stream);
+    simple.packed = true;
+  }
+  backend::heat_cg(order, simple.solve, stream);
+  backend::heat_finish(a, stream);
+}
+#endif
 
 template <class T, int D>
 class HeatSteps {
@@ -42,9 +59,6 @@ class HeatSteps {
   // Whether begin() is needed: G2P has not stored the present volumes, or laws store what they dissipate.
   bool begins() const { return !has_volumes_ || heats_by_laws(); }
 
-  // Lets scenes of few simple steps have kernels of their own, on CUDA. The adjoint needs the increments of the solver.
-  void take_simple_steps() { simple_ = true; }
-
   // Computes the present volumes; before laws change F.
   void begin(const Field<const T>& F, const Field<const T>& J, const Field<const T>& rest, backend::Stream stream) {
     HeatVolumesArguments<T, D> a;
@@ -57,16 +71,17 @@ class HeatSteps {
     backend::heat_volumes(a, stream);
   }
 
-  // Lets G2P of the substep store the strain rates, and the volumes for the next substep; on CUDA in a call whose
-  // activations last.
-  void use_g2p() {
-    if (!s_.displacements.defined()) return;
-    if (!strain_rate_.defined()) strain_rate_ = empty(in_.x, {particles()});
+  // Lets G2P of the substep compute P2G of heat, and the volumes for the next substep; on CUDA in a call whose
+  // activations last. Sums on deterministic grids have an order.
+  void join_g2p(const Field<const T>& x, const Field<const T>& mass, const Field<const T>& velocity_gradient,
+                backend::Stream stream) {
+    if (!s_.displacements.defined() || in_.lattice.deterministic()) return;
+    make_nodes(stream);
     HeatAdvanceArguments<T, D>& a = s_.with_heat;
+    a.to_nodes = to_nodes(x, mass, velocity_gradient);
     a.rest = s_.p2g.volume;
-    a.volume = column(fields.now(), volume_);
-    a.strain_rate = field<T>(strain_rate_);
     a.volume_next = column(fields.next(true), volume_);
+    a.workspace = packs_in_g2p() ? workspace(stream) : nullptr;
     has_volumes_ = true;
   }
 
@@ -84,12 +99,15 @@ class HeatSteps {
   HeatSolution<T, D> conduct(const Field<const T>& x, const Field<const T>& mass, const Field<const T>& rest,
                              const Field<const T>& velocity_gradient, const Field<const int>& scene,
                              backend::Stream stream, const T* known = nullptr) {
-    make_nodes(stream);
-    HeatToNodesArguments<T, D> down = to_nodes(x, mass, velocity_gradient);
-    backend::heat_to_nodes(in_.lattice.order(), down, stream);
+    HeatToNodesArguments<T, D> down = s_.with_heat.to_nodes;
+    if (!down.sums.pointer) {
+      make_nodes(stream);
+      down = to_nodes(x, mass, velocity_gradient);
+      backend::heat_to_nodes(in_.lattice.order(), down, stream);
+    }
     find_largest(number_, scene, largest_, 1, stream);
     if (holds_surface()) add_layers(x, scene, stream);
-    means(stream);
+    if (!solves_for_sums()) means(stream);
     if (has_terms()) add_terms(x, rest, stream);
     HeatArguments<T, D> a = equations(x, stream);
     if (known)
@@ -144,7 +162,11 @@ class HeatSteps {
   bool has_gradient() const { return in_.heat.size() % 3 == 1; }
   bool exchanges() const { return holds_surface() || has_terms(); }
   // Whether scenes of few simple steps have kernels of their own. Sums on deterministic grids have an order.
-  bool takes_simple_steps() const { return simple_ && !in_.lattice.deterministic(); }
+  bool takes_simple_steps() const { return MPM_BACKEND == MPM_BACKEND_IS_cuda && !in_.lattice.deterministic(); }
+  // Whether the solve reads the sums of the nodes. Boundaries and the adjoint need averages in arrays.
+  bool solves_for_sums() const { return takes_simple_steps() && in_.resident && !exchanges() && held_nodes() == 0; }
+  // Whether G2P packs the particles for the simple steps; a held surface changes their conductance after it.
+  bool packs_in_g2p() const { return takes_simple_steps() && !holds_surface(); }
   double* rows_of_status() const { return static_cast<double*>(status.data_ptr()); }
   const T* held_temperature(int64_t k) const { return temperatures_.pointer + k * temperatures_.stride[0]; }
 
@@ -161,12 +183,14 @@ class HeatSteps {
   void check_held();
   void check_terms();
   void means(backend::Stream stream);
+  HeatCleared<T> next_cleared() const;
   void add_terms(const Field<const T>& x, const Field<const T>& rest, backend::Stream stream);
   void add_layers(const Field<const T>& x, const Field<const int>& scene, backend::Stream stream);
   void hold_nodes(HeatArguments<T, D>& a, backend::Stream stream);
   void read_parameter(const Tensor& t, const char* name);
   HeatValue<T> value(size_t k) const;
   void make_nodes(backend::Stream stream);
+  void* workspace(backend::Stream stream);
   int64_t lay_out_cleared(T* memory, int64_t nodes);
   HeatToNodesArguments<T, D> to_nodes(const Field<const T>& x, const Field<const T>& mass,
                                       const Field<const T>& velocity_gradient) const;
@@ -182,8 +206,8 @@ class HeatSteps {
   int gradient_ = -1, liquid_ = -1, volume_ = 1, dissipated_ = -1;  // columns
   std::vector<HeatValue<T>> values_;  // of the parameters; those per particle have no pointer
   std::vector<int> own_;              // index in `parameters`, or -1
-  Tensor conductance_, blend_, number_, changing_, strain_rate_ = absent();
-  bool has_volumes_ = false, simple_ = false;
+  Tensor conductance_, blend_, number_, changing_;
+  bool has_volumes_ = false;
   Field<const T> temperatures_;   // of the held obstacles [K, B]
   Tensor exchange_of_particles_;  // with the held surface
   Tensor start_, fixed_;
@@ -421,7 +445,6 @@ HeatToNodesArguments<T, D> HeatSteps<T, D>::to_nodes(const Field<const T>& x, co
   a.x = x;
   a.mass = mass;
   a.velocity_gradient = velocity_gradient;
-  a.strain_rate = constant(s_.with_heat.strain_rate);
   a.particles = columns();
   a.conductivity = value(0);
   a.specific_heat = value(1);
@@ -482,12 +505,16 @@ void HeatSteps<T, D>::means(backend::Stream stream) {
     a.start = static_cast<T*>(start_.data_ptr());
     a.fixed = static_cast<bool*>(fixed_.data_ptr());
   }
-  if (MPM_BACKEND == MPM_BACKEND_IS_cuda) {
-    const Tensor& next = cleared_[1 - turn_];
-    a.cleared = static_cast<T*>(next.data_ptr());
-    a.cleared_size = next.numel();
-  }
+  a.cleared = next_cleared();
   backend::heat_means(a, stream);
+}
+
+// The memory of the next substep.
+template <class T, int D>
+HeatCleared<T> HeatSteps<T, D>::next_cleared() const {
+  if (MPM_BACKEND == MPM_BACKEND_IS_cpu) return {};
+  const Tensor& next = cleared_[kTurns - 1 - turn_];
+  return {static_cast<T*>(next.data_ptr()), next.numel()};
 }
 
 template <class T, int D>
@@ -555,8 +582,12 @@ HeatArguments<T, D> HeatSteps<T, D>::equations(const Field<const T>& x, backend:
   a.near_blocks = s_.activation.max_blocks;
   a.x = x;
   a.conductance = field<const T>(conductance_);
-  a.heat_capacity = field<const T>(capacity_).pointer;
-  a.theta = field<const T>(theta_).pointer;
+  if (solves_for_sums()) {
+    a.sums = sums_;
+  } else {
+    a.heat_capacity = field<const T>(capacity_).pointer;
+    a.theta = field<const T>(theta_).pointer;
+  }
   a.dt = in_.dt;
   a.scene_dt = s_.p2g.scene_dt.pointer;
   a.tolerance = kNegligibleResidual;
@@ -573,10 +604,17 @@ HeatArguments<T, D> HeatSteps<T, D>::equations(const Field<const T>& x, backend:
   a.iterations = static_cast<int*>(iterations_.data_ptr());
   a.residual = static_cast<T*>(residual_.data_ptr());
   a.converged = static_cast<bool*>(converged_.data_ptr());
-  a.leaves_simple = takes_simple_steps();
-  if (!workspace_.defined()) workspace_ = empty(in_.x, {backend::heat_workspace(a, stream)}, ScalarType::Byte);
-  a.workspace = workspace_.data_ptr();
+  a.workspace = workspace(stream);
   return a;
+}
+
+// Of the solves.
+template <class T, int D>
+void* HeatSteps<T, D>::workspace(backend::Stream stream) {
+  HeatArguments<T, D> a;
+  a.topology = s_.p2g.topology;
+  if (!workspace_.defined()) workspace_ = empty(in_.x, {backend::heat_workspace(a, stream)}, ScalarType::Byte);
+  return workspace_.data_ptr();
 }
 
 // Solves the equations of all scenes, and adds the solves to the status.
@@ -603,13 +641,17 @@ template <class T, int D>
 void HeatSteps<T, D>::solve_by_simple_steps([[maybe_unused]] HeatArguments<T, D>& a,
                                             [[maybe_unused]] backend::Stream stream) {
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda
-  HeatSimpleArguments<T, D> simple{a, {product_[0], product_[1]}};
-  for (simple.step = 0; simple.step < kMostSimpleSteps; simple.step++)
-    backend::heat_simple_step(in_.lattice.order(), simple, stream);
-  backend::heat_cg(in_.lattice.order(), a, stream);
-  backend::heat_finish(HeatFinishArguments<T, D>{simple, field<const T>(theta_).pointer, sums_, rows_of_status(),
-                                                 s_.advance.displacement},
-                       stream);
+  HeatFinishArguments<T, D> finish;
+  finish.simple.solve = a;
+  finish.simple.packed = s_.with_heat.workspace != nullptr;
+  std::copy(std::begin(product_), std::end(product_), finish.simple.product);
+  finish.theta = field<const T>(theta_).pointer;
+  finish.sums = sums_;
+  if (!in_.resident) finish.increment = a.increment;
+  if (solves_for_sums()) finish.cleared = next_cleared();
+  finish.status = rows_of_status();
+  finish.displacement = s_.advance.displacement;
+  solve_simply(in_.lattice.order(), finish, stream);
 #endif
 }
 

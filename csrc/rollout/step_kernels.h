@@ -39,7 +39,7 @@ struct Substeps {
   GridUpdateArguments<T, D> update;
   ContactArguments<T, D> contact;
   G2PAdvanceArguments<T, D> advance;
-  HeatAdvanceArguments<T, D> with_heat;  // with `advance` of this struct
+  HeatAdvanceArguments<T, D> with_heat;  // with `advance` of this struct; without node sums: not together
   Pool<T, D> pool;
   Tensor stress = absent(), step_time = absent();
   Tensor scene_time = absent();                         // the time of each scene now, where each has its own
@@ -270,12 +270,12 @@ struct Substeps {
     if (flips()) add_flip(field<const T>(kept), stream);
   }
 
-  // G2P, which may also store what heat needs.
+  // G2P, together with P2G of heat where that is requested.
   void move_particles(backend::Stream stream) {
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda
-    if (with_heat.strain_rate.pointer) {
+    if (with_heat.to_nodes.sums.pointer) {
       with_heat.advance = advance;
-      return backend::heat_g2p_advance(in.lattice.order(), with_heat, stream);
+      return backend::heat_advance(in.lattice.order(), with_heat, stream);
     }
 #endif
     backend::g2p_advance(in.lattice.order(), advance, stream);

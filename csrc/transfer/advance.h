@@ -58,14 +58,6 @@ struct G2PAdvanceArguments {
   bool loads_ahead = false;
 };
 
-// G2P that also stores what heat needs, on CUDA: |sym ∇v|, and the volume after the step.
-template <class T, int D>
-struct HeatAdvanceArguments {
-  G2PAdvanceArguments<T, D> advance;
-  Field<const T> rest, volume;  // rest volume, and the volume before
-  Field<T> strain_rate, volume_next;
-};
-
 // Update of F or J that G2P defers to the next P2G, which loads them anyway and has the affine field for it.
 template <class T, int D>
 struct LateDeformation {

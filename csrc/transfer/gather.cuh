@@ -371,10 +371,10 @@ __device__ void gather_in_memory_order(const Task& task, const Schedule<const in
   }
 }
 
-template <bool Quads, int Order, class T, int K, int D>
+template <bool Quads, int Order, class T, int K, int D, int Threads = kGatherThreads>
 __device__ void load_tile(const NodeField<const T>& nodes, const int* slots, NodeValue<T, K>* tile) {
   constexpr int width = kBlockWidth + Order, size = D == 2 ? width * width : width * width * width;
-  for (int i = threadIdx.x; i < size; i += kGatherThreads) {
+  for (int i = threadIdx.x; i < size; i += Threads) {
     int node[D], neighbour = 0;
 #pragma unroll
     for (int axis = D - 1, rest = i; axis >= 0; axis--) {

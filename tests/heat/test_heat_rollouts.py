@@ -29,10 +29,10 @@ def compare(step, state, n=12, dt=DT, schedule=None, tolerance=1e-9):
         if value is None:
             assert found[name] is None, name
             continue
-        scale = float(value.abs().max()) + 1e-30
-        torch.testing.assert_close(
-            found[name], value, rtol=0, atol=tolerance * scale, msg=lambda m, n=name: f"{n}: {m}"
-        )
+        atol = tolerance * (float(value.abs().max()) + 1e-30)
+        if name == "C":  # of one particle it is the rounding of its velocity
+            atol += 64 * torch.finfo(value.dtype).eps * float(expected.v.abs().max()) / step.grid.dx
+        torch.testing.assert_close(found[name], value, rtol=0, atol=atol, msg=lambda m, n=name: f"{n}: {m}")
     assert torch.equal(torch.as_tensor(got.time), torch.as_tensor(expected.time))
     return got
 

@@ -34,7 +34,6 @@ class CudaCall {
     s_.facts.graph_loops = !loops_are_refused;
     schedule_ = schedule_of(in_.schedule, s_.facts);
     if (HeatSteps<T, D>::wanted(in_)) heat_.emplace(s_);
-    if (heat_ && in_.resident) heat_->take_simple_steps();
     if (ThermalLaws<T, D>::wanted(s_)) thermal_.emplace(s_, heat_ ? &*heat_ : nullptr);
     s_.laws_are_apart = thermal_ || (heat_ && heat_->heats_by_laws());
   }
@@ -143,7 +142,7 @@ class CudaCall {
     s_.activate(before_, status(into), on);
     if (heat_ && heat_->begins()) heat_->begin(from_.F, from_.J, s_.p2g.volume, on);
     thermal_ ? thermal_->run(on) : s_.run_laws(on);
-    if (heat_) heat_->use_g2p();
+    if (heat_) heat_->join_g2p(from_.x, s_.p2g.mass, constant(to.C), on);
     s_.move(on);
     if (heat_) {
       const Field<const int> scene{s_.activation.scene, {s_.activation.scene_stride}};
