@@ -507,3 +507,27 @@ def test_temperatures_of_nodes_go_step_by_step():
             ends.append(run(step, state, 3, DT).temperature)
     assert "other values than one for each scene" in plan_rollout(step, state, 3, DT).reasons["fused"]
     assert torch.equal(*ends)
+
+
+BOUNDS = {1: 1.0, 2: 0.1715728752538099, 3: 0.038475772933681186}
+"""Largest residual that k steps of a known bound c leave, in units of c^k: csrc/heat/solve.h."""
+
+
+@pytest.mark.parametrize("steps", sorted(BOUNDS))
+@pytest.mark.parametrize("share", [0.5, 0.99])
+def test_solves_of_few_steps(steps, share, device):
+    """A tolerance that a number of steps just reaches: the change of the temperatures is as exact as that, not more
+    exact by orders as that of conjugate gradients; and the energy is conserved to rounding."""
+    tolerance = 1e-5
+    c = share * (tolerance / BOUNDS[steps]) ** (1 / steps)
+    step, state = scene(2, device=device, transfer="flip")
+    state = state.replace(v=torch.zeros_like(state.v))
+    heat = step.heat
+    heat.conductivity = c / 4 * 1000.0 * 100.0 * 0.1**2 / DT  # r = κ dt/(ρ C dx²), and c = 4 r
+    heat.specific_heat, change = 100.0, []
+    for heat.tolerance in (tolerance, 1e-13):
+        end = mpm.rollout(step, state, 2, DT)
+        change.append(end.temperature - state.temperature)
+        energy = float((state.mass * end.temperature).sum()) - float((state.mass * state.temperature).sum())
+        assert abs(energy) <= 1e-14 * float((state.mass * state.temperature.abs()).sum())
+    assert tolerance * 1e-3 < relative_error(*change) < tolerance
