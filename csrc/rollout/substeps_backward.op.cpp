@@ -1,6 +1,6 @@
 #include "common/team.h"
 #include "rollout/heat_backward.h"
-#include "rollout/recorded.h"
+#include "rollout/thermal_laws_backward.op.h"
 
 // The adjoint of n steps in one call. The steps are recomputed with a record of the inputs of each, unless the forward
 // pass has made the record; then the adjoint kernels process them from the last to the first. On deterministic CUDA
@@ -47,7 +47,9 @@ class SubstepsBackward {
   int64_t columns() const { return s_.columns; }  // of the history of all laws
   int64_t blocks() const { return s_.update.block_count; }
   // Laws of temperature pass the adjoints of their parameters on.
-  bool wants_parameters(int64_t needs) const { return (needs & kParameters_) || r_.thermal; }
+  bool wants_parameters(int64_t needs) const {
+    return (needs & kParameters_) || (r_.thermal && r_.thermal->has_parameters());
+  }
   int64_t heat_columns() const { return r_.heat ? r_.heat->state_columns() : 0; }
 
   // The adjoints of the final state become those of the initial state; the others are accumulated.
@@ -63,6 +65,7 @@ class SubstepsBackward {
     if (s_.flips()) before_ = empty(in_.x, {3, rows, 1 + D});
     std::optional<HeatBackward<T, D>> heat;
     if (r_.heat) heat.emplace(r_, in_, stream_);
+    if (r_.thermal) thermal_.emplace(r_, in_, stream_);
     for (int64_t i = in_.n - 1; i >= 0; i--) {
       check_room(r_.return_to(i));
       if (s_.flips()) keep_adjoint(adjoints);
@@ -70,10 +73,10 @@ class SubstepsBackward {
       backward_advance(i, adjoints);
       backward_grid(i, adjoints, sums);
       if (s_.flips()) backward_kept(adjoints);
-      if (r_.thermal) r_.thermal->read({}, {}), r_.thermal->begin(stream_);
-      backward_laws(adjoints, heat ? heat->dissipated : absent());
-      if (r_.thermal)
-        r_.thermal->backward(field<T>(adjoints.parameters), HeatSteps<T, D>::column_of(adjoints.heat, 0), stream_);
+      const Tensor dissipated = heat ? heat->dissipated : absent();
+      if (thermal_) thermal_->before_laws(i, thermal_adjoints(adjoints, dissipated));
+      backward_laws(adjoints, dissipated);
+      if (thermal_) thermal_->after_laws(i, thermal_adjoints(adjoints, dissipated));
       if (heat) add_terms({{adjoints.x, heat->x_term}, {adjoints.F, heat->F_term}, {adjoints.J, heat->J_term}});
       if (adjoints.dt.defined()) add_terms({{adjoints.dt, motion_dt_}, {adjoints.dt, stress_dt_}});
       after_substeps(in_.x.size(0), 1, stream_);
@@ -84,6 +87,10 @@ class SubstepsBackward {
   // Those of the heat of a step, which adds to the adjoint of the velocity gradient after the step.
   static HeatAdjoints heat_adjoints(const Adjoints& a) {
     return {a.heat, a.heat_parameters, a.C, a.mass, a.volume, a.dt, a.heat_boundaries, a.heat_status};
+  }
+
+  ThermalAdjoints thermal_adjoints(const Adjoints& a, const Tensor& dissipated) const {
+    return {a.F, a.J, a.heat, stress_, dissipated, a.parameters, Tensor()};
   }
 
   // The adjoints of the motion of the nodes in a step.
@@ -126,6 +133,7 @@ class SubstepsBackward {
   bool recorded_;
   Recorded<T, D> r_;
   Substeps<T, D>& s_;
+  std::optional<ThermalLawsBackward<T, D>> thermal_;
   bool mls_;  // F and J move with the affine field
   Tensor stress_, F_term_, parameters_term_;
   Tensor motion_dt_, stress_dt_;  // of the end of a step, and of P2G [P]
@@ -380,6 +388,7 @@ void SubstepsBackward<T, D>::backward_laws(Adjoints& adjoints, const Tensor& dis
       a.grad_history = variable<const T, D>(field<const T>(adjoints.history), call.first_column, false);
       a.history = variable<T, D>(field<T>(adjoints.history), call.first_column, false);
     }
+    if (thermal_) thermal_->set(k, a);
     parameter -= int64_t(call.parameters.size());
     if (adjoints.parameters.defined())
       a.parameters = variable<T, D>(field<T>(a.adds ? adjoints.parameters : parameters_term_), parameter, false);
@@ -411,7 +420,6 @@ Gradients substeps_backward(const std::vector<OptionalTensor>& grads, int64_t ne
                             MPM_SUBSTEPS_PARAMETERS) {
   const SubstepsInputs in{MPM_SUBSTEPS_ARGUMENTS};
   check_positions(x);
-  check_heat_has_gradients(in);
   const bool holds_surface = in.heat_options.size() > 2 && in.heat_options[2] != 0;
   STD_TORCH_CHECK(!holds_surface || !(needs & kObstacles), "obstacles have no gradients where heat holds a surface");
   STD_TORCH_CHECK(grads.size() == kResults, "grads must have ", size_t(kResults), " entries, got ", grads.size());

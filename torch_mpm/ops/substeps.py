@@ -37,8 +37,7 @@ temperatures of the held obstacles [K, B], two numbers of each term [K, B, 2] (f
 constant of Stefan and Boltzmann; and ambient temperature), and the power of a source [W/m³]; absent ones have the shape
 [0]. The columns of the result `heat` [P, m] are temperature, gradient and liquid fraction; `heat_status` [B, 3] has
 the number of solves that missed the tolerance, their largest residual [K], and the largest diffusion number of
-particles whose liquid fraction changed. With laws that expand or melt, steps are computed without
-gradients, where `resident` is true. Tables have no gradients, and obstacles none beside a held surface.
+particles whose liquid fraction changed. Tables have no gradients, and obstacles none beside a held surface.
 
 Where temperatures change, a name in `laws` may be that of a solid and, after a ~, of its liquid, as `Melting` has them.
 `thermal` are records of three numbers: a law, one of its parameters or -1 for the linear expansion of its material or
@@ -75,15 +74,15 @@ history.
 recomputes the steps, where there is no record, and then computes their adjoints in reverse order; a record must be that
 of `substeps`, and its contents are not checked. `grads` are the adjoints of the results x, v, C, F, J, history, impulse
 and heat, None where they are zero: one list, since an op has at most 64 arguments. Meanwhile it stores the inputs of
-each step: for a solid 2 D + 3 D² numbers per particle and step (33 in 3-D), D² more where a law is plastic, the history
-and the columns of heat; and the grid of each step where that is at most half as much. The node temperatures of each
-step are solved again where no grid is stored, and those of its adjoint once. The adjoints are [P, ...], those of the
-parameters [P, number of parameters] and that of gravity, over the time step, a sum for each block of the grids of all
-scenes [B * blocks, D]; that of the time step, but for gravity, is [P]. Those of the parameters of heat are [P, 5], in
-the order of conductivity, specific heat, melting point, latent heat and power; `heat_boundaries` [B, m] are those of
-both numbers of each term and of the temperatures of the held obstacles; `heat_status` is that of the adjoint solves.
-The bits of `needs` (`MASS`, `VOLUME`, `PARAMETERS`, `GRAVITY`, `OBSTACLES`, `TIME_STEP`, `HEAT_PARAMETERS`,
-`HEAT_BOUNDARIES`) select among the adjoints from that of mass on.
+each step: for a solid 2 D + 3 D² numbers per particle and step (33 in 3-D), D² more where a law is plastic, 2 D² + 2
+more where one melts, the history and the columns of heat; and the grid of each step where that is at most half as much.
+The node temperatures of each step are solved again where no grid is stored, and those of its adjoint once. The adjoints
+are [P, ...], those of the parameters [P, number of parameters] and that of gravity, over the time step, a sum for each
+block of the grids of all scenes [B * blocks, D]; that of the time step, but for gravity, is [P]. Those of the
+parameters of heat are [P, 5], in the order of conductivity, specific heat, melting point, latent heat and power;
+`heat_boundaries` [B, m] are those of both numbers of each term and of the temperatures of the held obstacles;
+`heat_status` is that of the adjoint solves. The bits of `needs` (`MASS`, `VOLUME`, `PARAMETERS`, `GRAVITY`,
+`OBSTACLES`, `TIME_STEP`, `HEAT_PARAMETERS`, `HEAT_BOUNDARIES`) select among the adjoints from that of mass on.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ from ..heat.heat import GRADIENT, TRANSFERS, Heat
 from ..laws.calls import laws_of, passive
 from ..laws.parameters import PerMaterial, check_length, evaluate, needed_temperature, tensors_in
 from ..laws.thermal import LIQUID
-from ..laws.thermal_calls import THERMAL, is_thermal
+from ..laws.thermal_calls import is_thermal
 from ..state.state import State
 from ..step.step import Step
 from .facts import obstacles_require_grad, wants_gradient
@@ -58,8 +58,6 @@ def _why_no_adjoint_of_laws(step: Step) -> str | None:
     """Reason why the op has no gradients of laws that read the temperature; None if it has, where these are tables of
     constant parameters (`check_heat_has_gradients` in csrc/rollout)."""
     laws = [law for law in map(passive, laws_of(step.law)) if is_thermal(law)]
-    if any(type(law) in THERMAL for law in laws):
-        return "a law expands or melts"
     if any(t.requires_grad for law in laws for t in tensors_in(law)):
         return "a law reads the temperature and has parameters with gradients"
     return None
