@@ -16,6 +16,7 @@ struct Adjoints {
   Tensor dt;                     // [P], with respect to dt * scene_dt, without gravity
   Tensor heat, heat_parameters;  // [P, m] in the order of the result, [P, kHeatParameters]
   Tensor heat_boundaries;        // [B, m], see HeatAdjoints
+  Tensor tables;                 // [P, m], of the values of all tables
   Tensor heat_status;            // of the adjoint solves
 };
 
@@ -28,7 +29,8 @@ enum Need : int64_t {
   kObstacles = 16,
   kTimeStep = 32,
   kHeatParameters_ = 64,
-  kHeatBoundaries = 128
+  kHeatBoundaries = 128,
+  kTables = 256
 };
 
 // Adjoints summed over the grid, undefined if not wanted: of gravity, by blocks of the domain, and of the table of
@@ -90,7 +92,7 @@ class SubstepsBackward {
   }
 
   ThermalAdjoints thermal_adjoints(const Adjoints& a, const Tensor& dissipated) const {
-    return {a.F, a.J, a.heat, stress_, dissipated, a.parameters, Tensor()};
+    return {a.F, a.J, a.heat, stress_, dissipated, a.parameters, a.tables};
   }
 
   // The adjoints of the motion of the nodes in a step.
@@ -411,7 +413,7 @@ void set(Tensor& adjoint, const OptionalTensor& grad, const char* name, const Te
 }
 
 using Gradients = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor,
-                             Tensor, Tensor, Tensor, Tensor, Tensor>;
+                             Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
 // The list of the adjoints of the results. An op has at most 64 arguments, the bits of the dispatcher.
 enum Result : size_t { kX, kV, kC, kF, kJ, kHistory, kImpulse, kHeat, kResults };
@@ -447,6 +449,9 @@ Gradients substeps_backward(const std::vector<OptionalTensor>& grads, int64_t ne
       adjoints.heat_status = empty(x, {in.scenes, int64_t(kHeatStatusSize)}, ScalarType::Double);
       torch::stable::zero_(adjoints.heat_status);
     }
+    int64_t values = 0;
+    for (const Tensor& table : in.tables) values += table.size(1);
+    adjoints.tables = result(x, needs & kTables, {P, values});
     set(adjoints.x, grads[kX], "grad_x", x);
     set(adjoints.v, grads[kV], "grad_v", x);
     set(adjoints.C, grads[kC], "grad_C", x);
@@ -454,8 +459,8 @@ Gradients substeps_backward(const std::vector<OptionalTensor>& grads, int64_t ne
     set(adjoints.J, grads[kJ], "grad_J", x);
     set(adjoints.history, grads[kHistory], "grad_history", x);
     set(adjoints.heat, grads[kHeat], "grad_heat", x);
-    for (Tensor* sum :
-         {&adjoints.mass, &adjoints.volume, &adjoints.parameters, &adjoints.dt, &adjoints.heat_parameters})
+    for (Tensor* sum : {&adjoints.mass, &adjoints.volume, &adjoints.parameters, &adjoints.dt, &adjoints.heat_parameters,
+                        &adjoints.tables})
       set(*sum, {}, "", x);
     if ((needs & kGravity) && has(gravity)) sums.gravity = zeros(x, {backward.blocks(), D});
     if ((needs & kObstacles) && has(obstacle_table)) sums.obstacles = zeros(x, sizes_of(*obstacle_table));
@@ -478,7 +483,8 @@ Gradients substeps_backward(const std::vector<OptionalTensor>& grads, int64_t ne
           adjoints.heat,
           adjoints.heat_parameters,
           adjoints.heat_boundaries,
-          adjoints.heat_status};
+          adjoints.heat_status,
+          adjoints.tables};
 }
 
 }  // namespace
@@ -489,7 +495,7 @@ STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
   m.def("substeps_backward(Tensor?[] grads, int needs, Tensor? record, " MPM_SUBSTEPS_SCHEMA
         ") -> (Tensor x, Tensor v, Tensor C, Tensor F, Tensor J, Tensor history, Tensor mass, Tensor volume, "
         "Tensor parameters, Tensor gravity, Tensor obstacles, Tensor dt, Tensor heat, Tensor heat_parameters, Tensor "
-        "heat_boundaries, Tensor heat_status)");
+        "heat_boundaries, Tensor heat_status, Tensor tables)");
 }
 #endif
 
