@@ -71,7 +71,7 @@ class SubstepsBackward {
     for (int64_t i = in_.n - 1; i >= 0; i--) {
       check_room(r_.return_to(i));
       if (s_.flips()) keep_adjoint(adjoints);
-      if (heat) heat->run(i, heat_adjoints(adjoints));
+      if (heat) heat->run(i, heat_adjoints(adjoints, sums));
       backward_advance(i, adjoints);
       backward_grid(i, adjoints, sums);
       if (s_.flips()) backward_kept(adjoints);
@@ -87,8 +87,8 @@ class SubstepsBackward {
 
  private:
   // Those of the heat of a step, which adds to the adjoint of the velocity gradient after the step.
-  static HeatAdjoints heat_adjoints(const Adjoints& a) {
-    return {a.heat, a.heat_parameters, a.C, a.mass, a.volume, a.dt, a.heat_boundaries, a.heat_status};
+  static HeatAdjoints heat_adjoints(const Adjoints& a, const GridSums& sums) {
+    return {a.heat, a.heat_parameters, a.C, a.mass, a.volume, a.dt, a.heat_boundaries, a.heat_status, sums.obstacles};
   }
 
   ThermalAdjoints thermal_adjoints(const Adjoints& a, const Tensor& dissipated) const {
@@ -422,8 +422,6 @@ Gradients substeps_backward(const std::vector<OptionalTensor>& grads, int64_t ne
                             MPM_SUBSTEPS_PARAMETERS) {
   const SubstepsInputs in{MPM_SUBSTEPS_ARGUMENTS};
   check_positions(x);
-  const bool holds_surface = in.heat_options.size() > 2 && in.heat_options[2] != 0;
-  STD_TORCH_CHECK(!holds_surface || !(needs & kObstacles), "obstacles have no gradients where heat holds a surface");
   STD_TORCH_CHECK(grads.size() == kResults, "grads must have ", size_t(kResults), " entries, got ", grads.size());
   const int64_t P = x.size(0);
   Adjoints adjoints;

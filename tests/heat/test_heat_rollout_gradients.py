@@ -320,6 +320,44 @@ def test_boundaries_of_scenes(per_particle, device):
     compare(step, uneven(step, state), 4, torch.tensor([1.0, 2.0, 0.5], dtype=F64) * DT)
 
 
+@pytest.mark.parametrize(*in_pairs(shape=["sphere", "box", "capsule", "path"], dim=[2, 3], scenes=[1, 2]))
+def test_obstacles_beside_a_held_surface(dim, shape, scenes, device):
+    """Gradients by the obstacle with the surface, and by another one, through contact and heat."""
+    step, state = scene(dim, scenes=scenes, device=device)
+    step.heat.tolerance = 1e-12
+    at, turn = torch.tensor([0.45, 0.25, 0.45][:dim], dtype=F64), torch.ones(1 if dim == 2 else 3, dtype=F64)
+    numbers = {
+        "at": at.expand(scenes, dim), "velocity": torch.tensor([3.0, 1.0, -2.0][:dim], dtype=F64), "turn": 0.3 * turn,
+        "rate": 20 * turn, "other": at + 0.15,
+    }  # fmt: skip
+    leaves = {name: t.to(device).clone().requires_grad_() for name, t in numbers.items()}
+    c, v, turn, rate, other = leaves.values()
+    region = {
+        "sphere": lambda: mpm.Sphere(c, 0.12, velocity=v),
+        "box": lambda: mpm.Box(c, (0.3, 0.15, 0.2)[:dim], rotation=turn, velocity=v, angular_velocity=rate),
+        "capsule": lambda: mpm.Capsule(c, (0.1, 1.0, 0.2)[:dim], 0.1, velocity=v, angular_velocity=rate),
+        "path": lambda: mpm.Sphere(lambda t: c[0] + v * t, 0.12),
+    }[shape]()
+    step = held(step, (heat_boundaries.FixedSurface, region, 40.0))
+    step.boundaries = [*step.boundaries.entries, mpm.Sphere(other, 0.1)]
+    state = uneven(step, state)
+    assert plan_rollout(step, state, 4, DT).executor == "fused"
+    ends = mpm.rollout(step, state, 4, DT), composed(step, state, 4, DT)
+    for of in (["temperature"], ALL):
+        grads = [
+            torch.autograd.grad(loss_of(end, of), list(leaves.values()), allow_unused=True, retain_graph=True)
+            for end in ends
+        ]
+        for name, found, expected in zip(leaves, *grads, strict=True):
+            if expected is None:
+                assert found is None
+                continue
+            error, scale = float((found - expected).abs().max()), float(expected.abs().max())
+            assert error <= 1e-9 * scale, f"{name}: {error / scale}"
+        used = dict(zip(leaves, grads[0], strict=True))
+        assert float(used["at"].abs().max()) > 0 and float(used["other"].abs().max()) > 0
+
+
 NUMBERS = {"flux": 4e6, "coefficient": 3e4, "ambient": 40.0, "emissivity": 0.9, "power": 2e8, "temperature": 20.0}
 
 
@@ -461,15 +499,6 @@ def test_reasons_for_single_steps(device):
     step, state = scene(2, device=device)
     state = state.replace(temperature=state.temperature.clone().requires_grad_())
     region = bodies(2)["plane"]
-    step = held(step, (heat_boundaries.FixedSurface, region, 1.0))
-    assert plan_rollout(step, state, 3, DT).executor == "fused"
-    step.boundaries = [
-        *step.boundaries.entries,
-        mpm.Sphere(torch.tensor([0.1, 0.1], device=device, requires_grad=True), 0.05),
-    ]
-    reason = "a surface is held at a temperature, and a gradient is wanted by an obstacle"
-    assert plan_rollout(step, state, 3, DT).reasons["fused"] == reason
-    step.boundaries = step.boundaries.entries[:-1]
     step = held(step, (heat_boundaries.Fixed, region, lambda t: t))
     assert plan_rollout(step, state, 3, DT).reasons["fused"] == "temperature of Fixed is a function"
 

@@ -37,7 +37,7 @@ temperatures of the held obstacles [K, B], two numbers of each term [K, B, 2] (f
 constant of Stefan and Boltzmann; and ambient temperature), and the power of a source [W/m³]; absent ones have the shape
 [0]. The columns of the result `heat` [P, m] are temperature, gradient and liquid fraction; `heat_status` [B, 3] has
 the number of solves that missed the tolerance, their largest residual [K], and the largest diffusion number of
-particles whose liquid fraction changed. Obstacles have no gradients beside a held surface.
+particles whose liquid fraction changed.
 
 Where temperatures change, a name in `laws` may be that of a solid and, after a ~, of its liquid, as `Melting` has them.
 `thermal` are records of three numbers: a law, one of its parameters or -1 for the linear expansion of its material or

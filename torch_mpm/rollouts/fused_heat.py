@@ -23,8 +23,6 @@ from ..laws.parameters import PerMaterial, check_length, evaluate, needed_temper
 from ..laws.thermal import LIQUID
 from ..state.state import State
 from ..step.step import Step
-from .facts import obstacles_require_grad
-from .steps import Steps
 
 
 def why_not_fused_heat(step: Step, state: State, n: int, dt: float | Tensor) -> str | None:
@@ -43,9 +41,6 @@ def why_not_fused_heat(step: Step, state: State, n: int, dt: float | Tensor) -> 
         return "it conducts heat with another stress form than mls"
     if any(_is_function(value) for value in heat.parameter_values):
         return "a parameter of its heat is a function"
-    surface = any(type(term) is FixedSurface for term in heat.boundaries.entries)
-    if surface and torch.is_grad_enabled() and obstacles_require_grad(Steps(step, n, dt), state):
-        return "a surface is held at a temperature, and a gradient is wanted by an obstacle"
     return None
 
 
