@@ -116,6 +116,13 @@ void heat_layers_backward(const HeatLayersBackwardArguments<T, D>& a) {
   });
 }
 
+template <class T, int D>
+void heat_surface_row_backward(const HeatSurfaceRowBackwardArguments<T, D>& a) {
+  for_blocks(a.topology, [&](int, const int (&)[D], int64_t slot) {
+    for (int entry = 0; entry < ObstacleRow<T, D>::width; entry++) heat_surface_row_backward(a, slot, entry);
+  });
+}
+
 template <int Order, class T, int D>
 void heat_to_nodes_backward(const HeatToNodesBackwardArguments<T, D>& a) {
   a.gradient.pointer ? from_nodes<Order, true>(a) : from_nodes<Order, false>(a);
@@ -129,6 +136,7 @@ MPM_INSTANTIATE(heat_held_backward, HeatHeldBackwardArguments)
 MPM_INSTANTIATE(heat_surface_temperature_backward, HeatSurfaceTemperatureBackwardArguments)
 MPM_INSTANTIATE(heat_nodes_backward, HeatNodesBackwardArguments)
 MPM_INSTANTIATE(heat_layers_backward, HeatLayersBackwardArguments)
+MPM_INSTANTIATE(heat_surface_row_backward, HeatSurfaceRowBackwardArguments)
 MPM_INSTANTIATE_ORDERS(heat_to_nodes_backward, HeatToNodesBackwardArguments)
 
 }  // namespace TORCH_MPM_ISA

@@ -101,6 +101,15 @@ MPM_HD void held_backward(const HeatHeldBackwardArguments<T, D>& a, int64_t slot
   at_slot<held_temperature_of_slot<T, D>>(a.hold.topology, a, slot);
 }
 
+// An entry of a slot for each thread: the particles of a slot are many.
+template <class T, int D>
+MPM_HD void surface_row_backward(const HeatSurfaceRowBackwardArguments<T, D>& a, int64_t i) {
+  const int64_t slot = i / ObstacleRow<T, D>::width;
+  int corner[D];
+  if (scene_of_slot(a.topology, slot, corner) >= 0)
+    heat_surface_row_backward(a, slot, int(i % ObstacleRow<T, D>::width));
+}
+
 template <class T, int D>
 MPM_HD void surface_temperature_backward(const HeatSurfaceTemperatureBackwardArguments<T, D>& a, int64_t slot) {
   at_slot<surface_temperature_of_slot<T, D>>(a.topology, a, slot);
@@ -146,6 +155,11 @@ void heat_layers_backward(const HeatLayersBackwardArguments<T, D>& a, Stream str
   for_each<heat_layer_backward<T, D>>(a.layers.particles, a, stream);
 }
 
+template <class T, int D>
+void heat_surface_row_backward(const HeatSurfaceRowBackwardArguments<T, D>& a, Stream stream) {
+  for_each<surface_row_backward<T, D>>(int64_t(a.topology.max_blocks) * ObstacleRow<T, D>::width, a, stream);
+}
+
 template <int Order, class T, int D>
 void heat_to_nodes_backward(const HeatToNodesBackwardArguments<T, D>& a, Stream stream) {
   if (a.gradient.pointer)
@@ -161,6 +175,7 @@ MPM_INSTANTIATE(heat_held_backward, HeatHeldBackwardArguments)
 MPM_INSTANTIATE(heat_surface_temperature_backward, HeatSurfaceTemperatureBackwardArguments)
 MPM_INSTANTIATE(heat_nodes_backward, HeatNodesBackwardArguments)
 MPM_INSTANTIATE(heat_layers_backward, HeatLayersBackwardArguments)
+MPM_INSTANTIATE(heat_surface_row_backward, HeatSurfaceRowBackwardArguments)
 MPM_INSTANTIATE_ORDERS(heat_to_nodes_backward, HeatToNodesBackwardArguments)
 
 }  // namespace mpm::cuda

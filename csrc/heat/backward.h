@@ -95,6 +95,16 @@ struct HeatLayersBackwardArguments {
   Field<const T> moment;             // [P, kHeatForms, D] with ∇(θ + d) and ∇λ
   Field<T> conductance;              // adjoint of κ V
   Field<T> x;                        // adjoint of the position by the distance from the surface
+  Field<T> distance;                 // adjoint of that distance [P], absent where that of the obstacle is not wanted
+};
+
+// Adjoint of the row of the obstacle with the held surface, by the distances of particles.
+template <class T, int D>
+struct HeatSurfaceRowBackwardArguments {
+  Topology<T, D> topology;
+  HeatLayersArguments<T, D> layers;  // its results are unused
+  Field<const T> distance;           // adjoint of the distance of each particle
+  T* sums = nullptr;                 // [max_blocks, width of a row], written for slots of the scenes
 };
 
 // Adjoint of P2G and of the weights of the particles.

@@ -51,5 +51,6 @@ MPM_BACKEND_KERNELS(MPM_HEAT_CPU_KERNELS)
   PLAIN(heat_surface_temperature_backward, HeatSurfaceTemperatureBackwardArguments) \
   PLAIN(heat_nodes_backward, HeatNodesBackwardArguments)                            \
   PLAIN(heat_layers_backward, HeatLayersBackwardArguments)                          \
+  PLAIN(heat_surface_row_backward, HeatSurfaceRowBackwardArguments)                 \
   ORDERED(heat_to_nodes_backward, HeatToNodesBackwardArguments)
 MPM_BACKEND_KERNELS(MPM_HEAT_BACKWARD_KERNELS)

@@ -287,18 +287,19 @@ MPM_HD typename At::Value pull_back_conduction(const HeatToNodesBackwardArgument
   return -dot(of_after, of_multiplier);
 }
 
-// Signed distance of a particle from the held surface, and its derivative along an axis: that of a surface which moves
-// the other way.
+constexpr int kPositionEntry = 1;  // of the first coordinate in ObstacleRow
+
+// Derivative of the signed distance of a particle from the held surface, by an entry of the row of its obstacle. The
+// derivative by the position of the particle is that of an obstacle which moves the other way.
 template <class T, int D>
-MPM_HD Dual<T> distance_along(const HeatLayersArguments<T, D>& a, int scene, const Vector<T, D>& x, int axis) {
+MPM_HD T distance_by_entry(const HeatLayersArguments<T, D>& a, int scene, const Vector<T, D>& x, int entry) {
   using S = Dual<T>;
   const ObstacleRow<T, D>& row = rows_of_scene(a.contact, scene)[a.obstacle];
   ObstacleRow<S, D> moved;
   const T* const values = reinterpret_cast<const T*>(&row);
   S* const lifted = reinterpret_cast<S*>(&moved);
-  for (int k = 0; k < ObstacleRow<T, D>::width; k++) lifted[k] = S(values[k], T(0));
-  moved.position[axis].derivative = T(-1);
-  return distance_from(obstacle_pose(a.contact, a.contact.kind[a.obstacle], moved, scene), x);
+  for (int k = 0; k < ObstacleRow<T, D>::width; k++) lifted[k] = S(values[k], T(k == entry));
+  return distance_from(obstacle_pose(a.contact, a.contact.kind[a.obstacle], moved, scene), x).derivative;
 }
 
 // Adjoints of the conductance κ V of a particle and of its distance from the surface. A share of κ V conducts, and
@@ -313,6 +314,7 @@ MPM_HD void heat_layer_backward(const HeatLayersBackwardArguments<T, D>& a, int6
   const T distance = distance_from(pose_of(a.layers.contact, a.layers.obstacle, scene), x), width = T(a.layers.width);
   store_scalar(at, a.conductance, by_rest);
   store_vector<D>(at, a.x, zero_vector<T, D>());
+  if (a.distance.pointer) store_scalar(at, a.distance, T(0));
   if (distance >= width || (by_rest == T(0) && by_exchange == T(0))) return;  // the latter outside the grid
   const HeatLayerAt<Dual<T>> layer = heat_layer(Dual<T>(distance, T(1)), Dual<T>(width, T(0)));
   store_scalar(at, a.conductance, layer.share.value * by_rest + layer.rate.value * by_exchange);
@@ -322,9 +324,25 @@ MPM_HD void heat_layer_backward(const HeatLayersBackwardArguments<T, D>& a, int6
                                      step_of_scene(f.scene_dt, f.dt, scene), T(0), f.topology.geometry.dx)
                             .conductance;
   const T by_distance = conductance * (layer.share.derivative * by_rest + layer.rate.derivative * by_exchange);
+  if (a.distance.pointer) store_scalar(at, a.distance, by_distance);
   Vector<T, D> grad;
-  for (int i = 0; i < D; i++) grad[i] = by_distance * distance_along(a.layers, scene, x, i).derivative;
+  for (int i = 0; i < D; i++) grad[i] = -by_distance * distance_by_entry(a.layers, scene, x, kPositionEntry + i);
   store_vector<D>(at, a.x, grad);
+}
+
+// An entry of the row by the particles whose base block a slot has.
+template <class T, int D>
+MPM_HD void heat_surface_row_backward(const HeatSurfaceRowBackwardArguments<T, D>& a, int64_t slot, int entry) {
+  T sum = T(0);
+  for (int i = a.topology.offsets[slot]; i < a.topology.offsets[slot + 1]; i++) {
+    const int64_t p = a.topology.index[i];
+    const One<T> at{p};
+    const T adjoint = load_scalar(at, a.distance);
+    if (adjoint == T(0)) continue;
+    const Vector<T, D> x = load_vector<D>(at, a.layers.x);
+    sum += adjoint * distance_by_entry(a.layers, scene_of_particle(a.layers, p), x, entry);
+  }
+  a.sums[slot * ObstacleRow<T, D>::width + entry] = sum;
 }
 
 // Power of a particle by the energy that its law dissipates.

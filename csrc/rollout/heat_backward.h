@@ -14,6 +14,7 @@ struct HeatAdjoints {
   Tensor velocity_gradient, mass, volume, dt;
   Tensor boundaries;  // [B, m]: of both numbers of each term, and of the temperatures of the held obstacles
   Tensor status;      // [B, kHeatStatusSize] of the adjoint solves, as that of the solves of a call
+  Tensor obstacles;   // of the table of obstacles
 };
 
 template <class T, int D>
@@ -37,7 +38,7 @@ class HeatBackward {
     if (adjoints.boundaries.defined()) adjoint_of_boundaries(solution, adjoints.boundaries);
     adjoint_of_nodes(solution, adjoints.dt.defined());
     gather(solution.down, adjoints.dt.defined());
-    if (heat().holds_surface()) adjoint_of_layers(solution.down);
+    if (heat().holds_surface()) adjoint_of_layers(i, solution.down, adjoints.obstacles);
     backend::heat_to_nodes_backward(order(), to_nodes(i, solution.down, adjoints), stream_);
     position_gradient(solution.down);
   }
@@ -64,7 +65,8 @@ class HeatBackward {
   void adjoint_of_terms(const HeatSolution<T, D>& solution);
   void adjoint_of_boundaries(const HeatSolution<T, D>& solution, const Tensor& sums);
   void adjoint_of_surface_temperature(const HeatSolution<T, D>& solution, const HeatSlotSums<T>& to);
-  void adjoint_of_layers(const HeatToNodesArguments<T, D>& down);
+  void adjoint_of_layers(int64_t i, const HeatToNodesArguments<T, D>& down, const Tensor& obstacles);
+  void adjoint_of_surface(int64_t i, const HeatLayersBackwardArguments<T, D>& layers, const Tensor& obstacles);
   void adjoint_of_nodes(const HeatSolution<T, D>& solution, bool by_dt);
   void gather(const HeatToNodesArguments<T, D>& down, bool by_dt);
   HeatToNodesBackwardArguments<T, D> to_nodes(int64_t i, const HeatToNodesArguments<T, D>& down,
@@ -80,8 +82,9 @@ class HeatBackward {
   Tensor slot_sums_, counted_;  // of the numbers of the boundary, by slots; nodes that are held
   // Adjoints of the sums of the free surface, and of θ by the terms; [P, 1 + D], [P, 1 + D, D].
   Tensor surface_, by_terms_, surface_value_, surface_gradient_;
-  // Of a held surface: adjoint of the exchange of the nodes, and gathered [P, 1]; of κ V [P], and of x [P, D].
-  Tensor layer_, layer_exchange_, layer_of_particles_, by_conductance_, x_layer_;
+  // Of a held surface: adjoint of the exchange of the nodes, and gathered [P, 1]; of κ V [P], of x [P, D], and of the
+  // distance [P]; of the row of its obstacle, by slots.
+  Tensor layer_, layer_exchange_, layer_of_particles_, by_conductance_, x_layer_, by_distance_, row_sums_;
   Tensor iterations_, residual_, converged_, workspace_, operator_workspace_;
 };
 
@@ -351,7 +354,7 @@ HeatToNodesBackwardArguments<T, D> HeatBackward<T, D>::to_nodes(int64_t i, const
 
 // Particles around the held surface: their exchange at the nodes, the rest of their conductance and their distance.
 template <class T, int D>
-void HeatBackward<T, D>::adjoint_of_layers(const HeatToNodesArguments<T, D>& down) {
+void HeatBackward<T, D>::adjoint_of_layers(int64_t i, const HeatToNodesArguments<T, D>& down, const Tensor& obstacles) {
   GatherArguments<T, D> gather;
   gather.topology = down.topology;
   gather.x = down.x;
@@ -365,7 +368,29 @@ void HeatBackward<T, D>::adjoint_of_layers(const HeatToNodesArguments<T, D>& dow
   a.moment = field<const T>(moment_);
   a.conductance = field<T>(by_conductance_);
   a.x = field<T>(x_layer_);
+  if (obstacles.defined() && !by_distance_.defined()) by_distance_ = empty(in_.x, {in_.x.size(0)});
+  a.distance = field<T>(by_distance_);
   backend::heat_layers_backward(a, stream_);
+  if (obstacles.defined()) adjoint_of_surface(i, a, obstacles);
+}
+
+// Adds the adjoint of the obstacle of the held surface.
+template <class T, int D>
+void HeatBackward<T, D>::adjoint_of_surface(int64_t i, const HeatLayersBackwardArguments<T, D>& layers,
+                                            const Tensor& obstacles) {
+  constexpr int width = ObstacleRow<T, D>::width;
+  const Topology<T, D>& t = layers.down.topology;
+  const ContactArguments<T, D>& contact = layers.layers.contact;
+  if (!row_sums_.defined() || row_sums_.size(0) != t.max_blocks)
+    row_sums_ = empty(in_.x, {int64_t(t.max_blocks), width});
+  backend::clear(row_sums_, stream_);
+  backend::heat_surface_row_backward(
+      HeatSurfaceRowBackwardArguments<T, D>{t, layers.layers, constant(layers.distance), rows(row_sums_)}, stream_);
+  const int64_t row = i * contact.step_stride + layers.layers.obstacle;
+  backend::sum_slots(SumSlotsArguments<T, D>{{t.max_blocks, t.geometry.blocks_per_scene, t.block, contact.rows, width,
+                                              contact.rows > 1, rows(row_sums_), rows(obstacles) + row * width,
+                                              int64_t(contact.obstacles) * width}},
+                     stream_);
 }
 
 // Of all forms: those of the step at once, those of the free surface, and that of the exchange of a held surface.

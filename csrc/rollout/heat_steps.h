@@ -224,15 +224,6 @@ class HeatSteps {
   Tensor theta_, capacity_, increment_, iterations_, residual_, converged_, workspace_;
 };
 
-// The adjoint has no laws that expand or melt (torch_mpm/rollouts/fused_heat.py).
-inline void check_heat_has_gradients(const SubstepsInputs& in) {
-  bool parameters_alone = in.laws.find('~') == std::string::npos;
-  for (size_t r = 1; r < in.thermal.size(); r += 3) parameters_alone &= in.thermal[r] >= 0;
-  STD_TORCH_CHECK(parameters_alone,
-                  "heat with laws that expand or melt is computed without gradients: records must be false, and "
-                  "resident true");
-}
-
 template <class T, int D>
 HeatSteps<T, D>::HeatSteps(Substeps<T, D>& steps) : s_(steps), in_(steps.in) {
   const Tensor& x = in_.x;

@@ -8,7 +8,7 @@
 #include "rollout/schedules/block_per_scene.h"
 #include "rollout/segment_clock.h"
 #include "rollout/survey.h"
-#include "rollout/thermal_laws.h"
+#include "rollout/thermal_laws_backward.h"
 
 #define MPM_ROLLOUT_KERNELS(PLAIN, ORDERED, SIZE)   \
   PLAIN(survey, SurveyArguments)                    \
@@ -28,10 +28,11 @@ MPM_BACKEND_KERNELS(MPM_ROLLOUT_KERNELS)
 MPM_BACKEND_KERNELS(MPM_SORTED_CPU_KERNELS)
 #endif
 
-#define MPM_THERMAL_LAWS_KERNELS(PLAIN, ORDERED, SIZE) \
-  PLAIN(begin_thermal_laws, ThermalLawsArguments)      \
-  PLAIN(end_thermal_laws, ThermalLawsArguments)        \
-  PLAIN(thermal_laws_backward, ThermalLawsBackwardArguments)
+#define MPM_THERMAL_LAWS_KERNELS(PLAIN, ORDERED, SIZE)           \
+  PLAIN(begin_thermal_laws, ThermalLawsArguments)                \
+  PLAIN(end_thermal_laws, ThermalLawsArguments)                  \
+  PLAIN(end_thermal_laws_backward, ThermalLawsBackwardArguments) \
+  PLAIN(begin_thermal_laws_backward, ThermalLawsBackwardArguments)
 MPM_BACKEND_KERNELS(MPM_THERMAL_LAWS_KERNELS)
 
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda

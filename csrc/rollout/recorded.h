@@ -90,6 +90,8 @@ class Recorded {
   std::optional<ThermalLaws<T, D>> thermal;
   Record<T> x, v, C, F, J, residual, history, stress;
   Record<T> mapped;      // F after the return maps
+  Record<T> mapped_J;    // J after laws that melt
+  Record<T> difference;  // of the stresses of the phases of laws that melt
   Record<T> heat_after;  // temperature, gradient and liquid fraction
   Record<T> dissipated;  // energy that laws have turned into heat
 
@@ -104,6 +106,9 @@ class Recorded {
   bool return_to(int64_t i);
 
   Field<const int> scene_of_particles() const { return {steps.activation.scene, {steps.activation.scene_stride}}; }
+
+  // Sets the inputs and the results of the laws of temperature of that step.
+  void use_thermal_laws(int64_t i) { thermal->read(mapped[i], mapped_J[i], difference[i]); }
 
   // Computes the node temperatures of that step again.
   HeatSolution<T, D> conduct_again(int64_t i) {
@@ -169,6 +174,7 @@ class Recorded {
 
   void read(int64_t i) {
     steps.read(state(i), mapped[i]);
+    if (steps.melts) steps.advance.J = constant(mapped_J[i]);
     for (LawUpdateArguments<T, D>& law : steps.laws) law.stress = stress[i];
     steps.p2g.stress = constant(stress[i]);
   }
@@ -202,8 +208,12 @@ class Recorded {
 
   bool activate(int64_t i) { return steps.activate(i == 0 && !goes_on_ ? nullptr : status(i - 1), status(i), stream_); }
 
-  // Copies the fields that a law of a mixture writes only for its own particles.
+  // Copies the fields that a law of a mixture writes only for its own particles, and one that melts only for some.
   void keep_others(int64_t i) {
+    if (steps.melts) {
+      Tensor to = mapped_J.scalar(i);
+      torch::stable::copy_(to, i == 0 ? in_.J.value() : J.scalar(i - 1));
+    }
     if (steps.plastic) {
       Tensor to = mapped.matrix(i);
       torch::stable::copy_(to, i == 0 ? in_.F.value() : F.matrix(i - 1));
@@ -307,6 +317,8 @@ void Recorded<T, D>::lay_out(Arena& arena) {
   if (steps.columns > 0) history = Record<T>(arena, given, n, steps.columns);
   stress = Record<T>(arena, given, n, D, D);
   if (steps.plastic) mapped = Record<T>(arena, given, n, D, D);
+  if (steps.melts) mapped_J = Record<T>(arena, given, n);
+  if (steps.melts) difference = Record<T>(arena, given, n, D, D);
   if (heat) heat_after = Record<T>(arena, given, n, heat->state_columns());
   if (heat && heat->heats_by_laws()) dissipated = Record<T>(arena, given, n);
   status_ = arena.take<int>((1 + n) * (1 + in_.scenes) * kStatusSize);
@@ -342,9 +354,9 @@ bool Recorded<T, D>::run() {
     if (!activate(i)) return false;
     if (!memory().defined()) keeps_grids_ = steps.nodes_are_clear = false;  // all steps share the grown pool
     steps.write({x[i], v[i], C[i], F[i], J[i], residual[i], history[i]});
-    if (has(in_.material)) keep_others(i);
+    if (has(in_.material) || steps.melts) keep_others(i);
     if (heat) begin_heat(i);
-    if (thermal) thermal->read({}, {});
+    if (thermal) use_thermal_laws(i);
     thermal ? thermal->run(stream_) : steps.run_laws(stream_);
     steps.move(stream_);
     if (heat) conduct_heat(i);

@@ -1,6 +1,6 @@
 #include "common/team.h"
 #include "rollout/heat_backward.h"
-#include "rollout/recorded.h"
+#include "rollout/thermal_laws_backward.op.h"
 
 // The adjoint of n steps in one call. The steps are recomputed with a record of the inputs of each, unless the forward
 // pass has made the record; then the adjoint kernels process them from the last to the first. On deterministic CUDA
@@ -16,6 +16,7 @@ struct Adjoints {
   Tensor dt;                     // [P], with respect to dt * scene_dt, without gravity
   Tensor heat, heat_parameters;  // [P, m] in the order of the result, [P, kHeatParameters]
   Tensor heat_boundaries;        // [B, m], see HeatAdjoints
+  Tensor tables;                 // [P, m], of the values of all tables
   Tensor heat_status;            // of the adjoint solves
 };
 
@@ -28,7 +29,8 @@ enum Need : int64_t {
   kObstacles = 16,
   kTimeStep = 32,
   kHeatParameters_ = 64,
-  kHeatBoundaries = 128
+  kHeatBoundaries = 128,
+  kTables = 256
 };
 
 // Adjoints summed over the grid, undefined if not wanted: of gravity, by blocks of the domain, and of the table of
@@ -47,7 +49,9 @@ class SubstepsBackward {
   int64_t columns() const { return s_.columns; }  // of the history of all laws
   int64_t blocks() const { return s_.update.block_count; }
   // Laws of temperature pass the adjoints of their parameters on.
-  bool wants_parameters(int64_t needs) const { return (needs & kParameters_) || r_.thermal; }
+  bool wants_parameters(int64_t needs) const {
+    return (needs & kParameters_) || (r_.thermal && r_.thermal->has_parameters());
+  }
   int64_t heat_columns() const { return r_.heat ? r_.heat->state_columns() : 0; }
 
   // The adjoints of the final state become those of the initial state; the others are accumulated.
@@ -63,17 +67,18 @@ class SubstepsBackward {
     if (s_.flips()) before_ = empty(in_.x, {3, rows, 1 + D});
     std::optional<HeatBackward<T, D>> heat;
     if (r_.heat) heat.emplace(r_, in_, stream_);
+    if (r_.thermal) thermal_.emplace(r_, in_, stream_);
     for (int64_t i = in_.n - 1; i >= 0; i--) {
       check_room(r_.return_to(i));
       if (s_.flips()) keep_adjoint(adjoints);
-      if (heat) heat->run(i, heat_adjoints(adjoints));
+      if (heat) heat->run(i, heat_adjoints(adjoints, sums));
       backward_advance(i, adjoints);
       backward_grid(i, adjoints, sums);
       if (s_.flips()) backward_kept(adjoints);
-      if (r_.thermal) r_.thermal->read({}, {}), r_.thermal->begin(stream_);
-      backward_laws(adjoints, heat ? heat->dissipated : absent());
-      if (r_.thermal)
-        r_.thermal->backward(field<T>(adjoints.parameters), HeatSteps<T, D>::column_of(adjoints.heat, 0), stream_);
+      const Tensor dissipated = heat ? heat->dissipated : absent();
+      if (thermal_) thermal_->before_laws(i, thermal_adjoints(adjoints, dissipated));
+      backward_laws(adjoints, dissipated);
+      if (thermal_) thermal_->after_laws(i, thermal_adjoints(adjoints, dissipated));
       if (heat) add_terms({{adjoints.x, heat->x_term}, {adjoints.F, heat->F_term}, {adjoints.J, heat->J_term}});
       if (adjoints.dt.defined()) add_terms({{adjoints.dt, motion_dt_}, {adjoints.dt, stress_dt_}});
       after_substeps(in_.x.size(0), 1, stream_);
@@ -82,8 +87,12 @@ class SubstepsBackward {
 
  private:
   // Those of the heat of a step, which adds to the adjoint of the velocity gradient after the step.
-  static HeatAdjoints heat_adjoints(const Adjoints& a) {
-    return {a.heat, a.heat_parameters, a.C, a.mass, a.volume, a.dt, a.heat_boundaries, a.heat_status};
+  static HeatAdjoints heat_adjoints(const Adjoints& a, const GridSums& sums) {
+    return {a.heat, a.heat_parameters, a.C, a.mass, a.volume, a.dt, a.heat_boundaries, a.heat_status, sums.obstacles};
+  }
+
+  ThermalAdjoints thermal_adjoints(const Adjoints& a, const Tensor& dissipated) const {
+    return {a.F, a.J, a.heat, stress_, dissipated, a.parameters, a.tables};
   }
 
   // The adjoints of the motion of the nodes in a step.
@@ -126,6 +135,7 @@ class SubstepsBackward {
   bool recorded_;
   Recorded<T, D> r_;
   Substeps<T, D>& s_;
+  std::optional<ThermalLawsBackward<T, D>> thermal_;
   bool mls_;  // F and J move with the affine field
   Tensor stress_, F_term_, parameters_term_;
   Tensor motion_dt_, stress_dt_;  // of the end of a step, and of P2G [P]
@@ -380,6 +390,7 @@ void SubstepsBackward<T, D>::backward_laws(Adjoints& adjoints, const Tensor& dis
       a.grad_history = variable<const T, D>(field<const T>(adjoints.history), call.first_column, false);
       a.history = variable<T, D>(field<T>(adjoints.history), call.first_column, false);
     }
+    if (thermal_) thermal_->set(k, a);
     parameter -= int64_t(call.parameters.size());
     if (adjoints.parameters.defined())
       a.parameters = variable<T, D>(field<T>(a.adds ? adjoints.parameters : parameters_term_), parameter, false);
@@ -402,7 +413,7 @@ void set(Tensor& adjoint, const OptionalTensor& grad, const char* name, const Te
 }
 
 using Gradients = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor,
-                             Tensor, Tensor, Tensor, Tensor, Tensor>;
+                             Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
 // The list of the adjoints of the results. An op has at most 64 arguments, the bits of the dispatcher.
 enum Result : size_t { kX, kV, kC, kF, kJ, kHistory, kImpulse, kHeat, kResults };
@@ -411,9 +422,6 @@ Gradients substeps_backward(const std::vector<OptionalTensor>& grads, int64_t ne
                             MPM_SUBSTEPS_PARAMETERS) {
   const SubstepsInputs in{MPM_SUBSTEPS_ARGUMENTS};
   check_positions(x);
-  check_heat_has_gradients(in);
-  const bool holds_surface = in.heat_options.size() > 2 && in.heat_options[2] != 0;
-  STD_TORCH_CHECK(!holds_surface || !(needs & kObstacles), "obstacles have no gradients where heat holds a surface");
   STD_TORCH_CHECK(grads.size() == kResults, "grads must have ", size_t(kResults), " entries, got ", grads.size());
   const int64_t P = x.size(0);
   Adjoints adjoints;
@@ -439,6 +447,9 @@ Gradients substeps_backward(const std::vector<OptionalTensor>& grads, int64_t ne
       adjoints.heat_status = empty(x, {in.scenes, int64_t(kHeatStatusSize)}, ScalarType::Double);
       torch::stable::zero_(adjoints.heat_status);
     }
+    int64_t values = 0;
+    for (const Tensor& table : in.tables) values += table.size(1);
+    adjoints.tables = result(x, needs & kTables, {P, values});
     set(adjoints.x, grads[kX], "grad_x", x);
     set(adjoints.v, grads[kV], "grad_v", x);
     set(adjoints.C, grads[kC], "grad_C", x);
@@ -446,8 +457,8 @@ Gradients substeps_backward(const std::vector<OptionalTensor>& grads, int64_t ne
     set(adjoints.J, grads[kJ], "grad_J", x);
     set(adjoints.history, grads[kHistory], "grad_history", x);
     set(adjoints.heat, grads[kHeat], "grad_heat", x);
-    for (Tensor* sum :
-         {&adjoints.mass, &adjoints.volume, &adjoints.parameters, &adjoints.dt, &adjoints.heat_parameters})
+    for (Tensor* sum : {&adjoints.mass, &adjoints.volume, &adjoints.parameters, &adjoints.dt, &adjoints.heat_parameters,
+                        &adjoints.tables})
       set(*sum, {}, "", x);
     if ((needs & kGravity) && has(gravity)) sums.gravity = zeros(x, {backward.blocks(), D});
     if ((needs & kObstacles) && has(obstacle_table)) sums.obstacles = zeros(x, sizes_of(*obstacle_table));
@@ -470,7 +481,8 @@ Gradients substeps_backward(const std::vector<OptionalTensor>& grads, int64_t ne
           adjoints.heat,
           adjoints.heat_parameters,
           adjoints.heat_boundaries,
-          adjoints.heat_status};
+          adjoints.heat_status,
+          adjoints.tables};
 }
 
 }  // namespace
@@ -481,7 +493,7 @@ STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
   m.def("substeps_backward(Tensor?[] grads, int needs, Tensor? record, " MPM_SUBSTEPS_SCHEMA
         ") -> (Tensor x, Tensor v, Tensor C, Tensor F, Tensor J, Tensor history, Tensor mass, Tensor volume, "
         "Tensor parameters, Tensor gravity, Tensor obstacles, Tensor dt, Tensor heat, Tensor heat_parameters, Tensor "
-        "heat_boundaries, Tensor heat_status)");
+        "heat_boundaries, Tensor heat_status, Tensor tables)");
 }
 #endif
 

@@ -1,4 +1,4 @@
-#include "rollout/thermal_laws.h"
+#include "rollout/thermal_laws_backward.h"
 
 #include "common/instantiate.h"
 #include "cpu/parallel.h"
@@ -30,13 +30,19 @@ void end_thermal_laws(const ThermalLawsArguments<T, D>& a) {
 }
 
 template <class T, int D>
-void thermal_laws_backward(const ThermalLawsBackwardArguments<T, D>& a) {
-  for_each(a.forward.particles, [&](int64_t p) { laws_of_backward(a, p); });
+void end_thermal_laws_backward(const ThermalLawsBackwardArguments<T, D>& a) {
+  for_each(a.forward.particles, [&](int64_t p) { end_laws_backward(a, p); });
+}
+
+template <class T, int D>
+void begin_thermal_laws_backward(const ThermalLawsBackwardArguments<T, D>& a) {
+  for_each(a.forward.particles, [&](int64_t p) { begin_laws_backward(a, p); });
 }
 
 MPM_INSTANTIATE(begin_thermal_laws, ThermalLawsArguments)
 MPM_INSTANTIATE(end_thermal_laws, ThermalLawsArguments)
-MPM_INSTANTIATE(thermal_laws_backward, ThermalLawsBackwardArguments)
+MPM_INSTANTIATE(end_thermal_laws_backward, ThermalLawsBackwardArguments)
+MPM_INSTANTIATE(begin_thermal_laws_backward, ThermalLawsBackwardArguments)
 
 }  // namespace TORCH_MPM_ISA
 }  // namespace mpm::cpu

@@ -14,6 +14,7 @@ template <class T>
 struct TemperatureTable {
   int knots = 0;
   const T *temperature = nullptr, *value = nullptr;
+  int first = 0;  // number of its first value in those of all tables
 };
 
 // A parameter of a law by a table.
@@ -40,47 +41,37 @@ struct ThermalLawsArguments {
   // of the liquid where it melts; energy that the solid dissipates, absent where it is not wanted.
   Field<T> next_F, next_J, stress, dissipated;
   Field<const T> liquid_stress;
+  Field<T> difference;  // stress of the liquid minus that of the solid, absent where not wanted
 
   MPM_HD bool has_elastic() const { return elastic_F.pointer || elastic_J.pointer; }
   MPM_HD bool begins() const { return parameter_count > 0 || has_elastic(); }
   MPM_HD bool ends() const { return next_F.pointer || next_J.pointer || liquid_stress.pointer; }
 };
 
-// Adjoint of the parameters by tables: those of a material, whose columns of the adjoints of all parameters become
-// zero.
-template <class T, int D>
-struct ThermalLawsBackwardArguments {
-  ThermalLawsArguments<T, D> forward;
-  int column[2 * kMostParameters] = {};  // of each parameter in those of all laws
-  Field<T> parameters;                   // [P, n]
-  Field<T> theta;                        // [P], added
+inline namespace TORCH_MPM_ISA {
+
+// Interval of a table of several knots, and share of the way from its first knot to its second one.
+template <class S>
+struct TablePlace {
+  int knot;
+  S share;
 };
 
-inline namespace TORCH_MPM_ISA {
+template <class S, class T>
+MPM_HD TablePlace<S> place_in(const TemperatureTable<T>& table, const S& theta) {
+  int left = 0;
+  while (left + 2 < table.knots && theta > lift<S>(table.temperature[left + 1])) left++;
+  const T* const knot = table.temperature + left;
+  return {left, clamp_to_unit((theta - lift<S>(knot[0])) / lift<S>(knot[1] - knot[0]))};
+}
 
 // At a temperature of any scalar.
 template <class S, class T>
 MPM_HD S value_at(const TemperatureTable<T>& table, const S& theta) {
-  int left = 0;
-  while (left + 2 < table.knots && theta > lift<S>(table.temperature[left + 1])) left++;
   if (table.knots == 1) return lift<S>(table.value[0]);
-  const T* const knot = table.temperature + left;
-  const S share = clamp_to_unit((theta - lift<S>(knot[0])) / lift<S>(knot[1] - knot[0]));
-  return lift<S>(table.value[left]) + share * lift<S>(table.value[left + 1] - table.value[left]);
-}
-
-template <class T, int D>
-MPM_HD void laws_of_backward(const ThermalLawsBackwardArguments<T, D>& a, int64_t p) {
-  if (!a.forward.members.has(p)) return;
-  const One<T> at{p};
-  const Dual<T> theta(load_scalar(at, a.forward.theta), T(1));
-  T sum = load_scalar(at, constant(a.theta));
-  for (int k = 0; k < a.forward.parameter_count; k++) {
-    T& adjoint = a.parameters.pointer[p * a.parameters.stride[0] + a.column[k] * a.parameters.stride[1]];
-    sum += value_at(a.forward.parameters[k].table, theta).derivative * adjoint;
-    adjoint = T(0);
-  }
-  store_scalar(at, a.theta, sum);
+  const TablePlace<S> at = place_in(table, theta);
+  const T* const value = table.value + at.knot;
+  return lift<S>(value[0]) + at.share * lift<S>(value[1] - value[0]);
 }
 
 template <class T, int D>
@@ -88,6 +79,18 @@ MPM_HD T stretch_of(const ThermalLawsArguments<T, D>& a, const One<T>& at) {
   if (a.expansion.knots == 0) return T(1);
   const T theta = load_scalar(at, a.theta);
   return thermal_stretch(value_at(a.expansion, theta), theta);
+}
+
+// Whether the solid of a particle has lost its coherency.
+template <class T, int D>
+MPM_HD bool has_collapsed(const ThermalLawsArguments<T, D>& a, const One<T>& at) {
+  return a.coherency.knots > 0 && load_scalar(at, a.fraction) >= a.coherency.value[0];
+}
+
+// Whether F of the material is that of its laws. F of a solid changes by plastic flow, and where it melts.
+template <class T, int D>
+MPM_HD bool changes_F(const ThermalLawsArguments<T, D>& a, const One<T>& at) {
+  return a.next_F.pointer && (a.is_plastic || has_collapsed(a, at));
 }
 
 template <class T, int D>
@@ -106,25 +109,24 @@ MPM_HD void begin_laws_of(const ThermalLawsArguments<T, D>& a, int64_t p) {
   if (a.elastic_J.pointer) store_scalar(at, a.elastic_J, phases.J);
 }
 
-// F of a solid changes by plastic flow, and where it melts; the stress of a solid without liquid is its own.
+// The stress of a solid without liquid is its own.
 template <class T, int D>
 MPM_HD void end_laws_of(const ThermalLawsArguments<T, D>& a, int64_t p) {
   if (!a.members.has(p)) return;
   const One<T> at{p};
-  const bool melts = a.coherency.knots > 0;
-  const T factor = stretch_of(a, at), fraction = melts ? load_scalar(at, a.fraction) : T(0);
-  const bool flows = melts && fraction >= a.coherency.value[0];
-  if (a.next_F.pointer && (a.is_plastic || flows))
-    store_matrix<D>(at, a.next_F, factor * load_matrix<D>(at, constant(a.elastic_F)));
+  const T factor = stretch_of(a, at), fraction = a.coherency.knots > 0 ? load_scalar(at, a.fraction) : T(0);
+  const bool flows = has_collapsed(a, at);
+  if (changes_F(a, at)) store_matrix<D>(at, a.next_F, factor * load_matrix<D>(at, constant(a.elastic_F)));
   if (a.next_J.pointer)
     store_scalar(at, a.next_J, volume_of_stretch<D>(factor) * load_scalar(at, constant(a.elastic_J)));
-  if (fraction == T(0) && !flows) return;
+  if (fraction == T(0) && !flows && !a.difference.pointer) return;
   const Matrix<T, D> solid = load_matrix<D>(at, constant(a.stress)), liquid = load_matrix<D>(at, a.liquid_stress);
   Matrix<T, D> stress;
   MPM_UNROLL for (int i = 0; i < D; i++) MPM_UNROLL
     for (int j = 0; j < D; j++)
       stress[i][j] = stress_of_phases(solid[i][j], liquid[i][j], fraction, a.coherency.value[0]);
   store_matrix<D>(at, a.stress, stress);
+  if (a.difference.pointer) store_matrix<D>(at, a.difference, liquid - solid);
   if (a.dissipated.pointer && flows) store_scalar(at, a.dissipated, T(0));
 }
 

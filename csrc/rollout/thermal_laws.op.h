@@ -21,7 +21,9 @@ TemperatureTable<T> temperature_table(const SubstepsInputs& in, int64_t number) 
   check_like(t, element("tables", int(number)).c_str(), in.x);
   STD_TORCH_CHECK(t.is_contiguous(), "tables must be contiguous");
   const T* const values = static_cast<const T*>(t.data_ptr());
-  return {int(knots), values, values + knots};
+  int64_t first = 0;
+  for (int64_t k = 0; k < number; k++) first += in.tables[size_t(k)].size(-1);
+  return {int(knots), values, values + knots, int(first)};
 }
 
 // What each law reads of the temperature. Records of the call: a law, the number of a parameter, kExpansion or
@@ -64,15 +66,16 @@ class ThermalLaws {
     const std::vector<LawTemperature<T>> laws = temperatures_of_laws<T>(s_.in, s_.calls);
     materials_.resize(laws.size());
     columns_.resize(laws.size());
+    liquid_stress_.resize(laws.size());
     int first = 0;
     for (size_t k = 0; k < laws.size(); k++) {
       const bool melts = s_.calls[k].melts;
-      ThermalLawsArguments<T, D>& a = materials_[melts ? k - 1 : k];
+      ThermalLawsArguments<T, D>& a = materials_[first_of(k)];
       a.particles = P;
       a.members = s_.laws[k].law.members;
       for (int i = 0; i < kMostParameters; i++)
         if (laws[k].parameters[i].knots > 0) {
-          columns_[melts ? k - 1 : k].push_back(first + i);
+          columns_[first_of(k)].push_back(first + i);
           add_parameter(a, s_.laws[k].law.parameters[i], laws[k].parameters[i]);
         }
       first += int(s_.calls[k].parameters.size());
@@ -82,8 +85,10 @@ class ThermalLaws {
     for (size_t k = 0; k < laws.size(); k++) make_buffers(k);
   }
 
-  // Replaces the settings of Substeps::read and Substeps::write for these laws. Laws change `F` and `J` in place.
-  void read(const Field<T>& F, const Field<T>& J) {
+  // Replaces the settings of Substeps::read and Substeps::write for these laws. F and J after the laws are written to
+  // `F` and `J`, which may be those before; their other entries are unchanged. See ThermalLawsArguments for
+  // `difference`.
+  void read(const Field<T>& F, const Field<T>& J, const Field<T>& difference = {}) {
     for (size_t k = 0; k < materials_.size(); k++) {
       if (s_.calls[k].melts) continue;
       ThermalLawsArguments<T, D>& a = materials_[k];
@@ -91,45 +96,52 @@ class ThermalLaws {
       if (has_liquid(k)) a.fraction = heat_->liquid_fraction();
       if (!a.has_elastic()) continue;
       (s_.calls[k].law->info.field == Deformation::gradient ? a.F : a.J) = s_.laws[k].law.state;
-      if (has_liquid(k)) a.J = constant(J), a.dissipated = s_.laws[k].dissipated;
       if (has_liquid(k) || s_.calls[k].law->info.plastic) a.next_F = F;
-      if (has_liquid(k)) a.next_J = J;
+      if (has_liquid(k)) {
+        a.J = s_.laws[k + 1].law.state;
+        a.next_J = J;
+        a.stress = s_.laws[k].stress;
+        a.dissipated = s_.laws[k].dissipated;
+        a.difference = difference;
+        s_.laws[k + 1].stress = liquid_stress_[k];
+        a.liquid_stress = constant(liquid_stress_[k]);
+        read_elastic(k + 1, a);
+      }
       read_elastic(k, a);
-      if (has_liquid(k)) read_elastic(k + 1, a);
     }
   }
 
-  // Computes the parameters by tables at the present temperatures.
+  // Computes what laws read: the parameters by tables at the present temperatures, F and J.
   void begin(backend::Stream stream) const {
     for (const ThermalLawsArguments<T, D>& a : materials_)
       if (a.begins()) backend::begin_thermal_laws(a, stream);
   }
 
-  // Passes the adjoints of the parameters by tables in those of all laws [P, n] to the temperature.
-  void backward(const Field<T>& parameters, const Field<T>& theta, backend::Stream stream) const {
-    for (size_t k = 0; k < materials_.size(); k++) {
-      if (columns_[k].empty()) continue;
-      ThermalLawsBackwardArguments<T, D> a;
-      a.forward = materials_[k];
-      std::copy(columns_[k].begin(), columns_[k].end(), a.column);
-      a.parameters = parameters;
-      a.theta = theta;
-      backend::thermal_laws_backward(a, stream);
-    }
-  }
-
   void run(backend::Stream stream) const {
     for (size_t k = 0; k < materials_.size(); k++) {
-      const ThermalLawsArguments<T, D>& a = materials_[s_.calls[k].melts ? k - 1 : k];
+      const ThermalLawsArguments<T, D>& a = materials_[first_of(k)];
       if (!s_.calls[k].melts && a.begins()) backend::begin_thermal_laws(a, stream);
       s_.run_law(k, stream);
       if (!has_liquid(k) && a.ends()) backend::end_thermal_laws(a, stream);
     }
   }
 
- private:
-  bool has_liquid(size_t k) const { return k + 1 < s_.calls.size() && s_.calls[k + 1].melts; }
+  size_t count() const { return materials_.size(); }  // of laws
+  // Arguments of the material whose first law is k, empty for other laws; and the columns of its parameters by tables
+  // in those of all laws.
+  const ThermalLawsArguments<T, D>& material(size_t k) const { return materials_[k]; }
+  const std::vector<int>& columns(size_t k) const { return columns_[k]; }
+  // Whether parameters depend on the temperature.
+  bool has_parameters() const {
+    return std::any_of(columns_.begin(), columns_.end(), [](const auto& of_law) { return !of_law.empty(); });
+  }
 
+  // Whether the material whose first law is k melts.
+  bool has_liquid(size_t k) const { return k + 1 < s_.calls.size() && s_.calls[k + 1].melts; }
+  // The first law of the material of law k.
+  size_t first_of(size_t k) const { return s_.calls[k].melts ? k - 1 : k; }
+
+ private:
   void add_parameter(ThermalLawsArguments<T, D>& a, Parameter<T>& p, const TemperatureTable<T>& table) {
     buffers_.push_back(empty(s_.in.x, {a.particles}));
     T* const to = static_cast<T*>(buffers_.back().data_ptr());
@@ -150,9 +162,7 @@ class ThermalLaws {
     if (gradient) a.elastic_F = buffer({a.particles, D, D});
     if (!gradient || has_liquid(k)) a.elastic_J = buffer({a.particles});
     if (!has_liquid(k)) return;
-    a.stress = s_.laws[k].stress;
-    const Field<T> liquid = s_.laws[k + 1].stress = buffer({a.particles, D, D});
-    a.liquid_stress = constant(liquid);
+    liquid_stress_[k] = buffer({a.particles, D, D});
   }
 
   void read_elastic(size_t k, const ThermalLawsArguments<T, D>& a) {
@@ -166,6 +176,7 @@ class ThermalLaws {
   const HeatSteps<T, D>* const heat_;
   std::vector<ThermalLawsArguments<T, D>> materials_;  // with their first law
   std::vector<std::vector<int>> columns_;              // of their parameters by tables in those of all laws
+  std::vector<Field<T>> liquid_stress_;
   Tensors buffers_;
 };
 

@@ -414,8 +414,6 @@ def test_raw_op():
         "the adjoint tolerance must be between 0 and 1": {"heat_scalars": [0.5, 0.0, 0.0, 0.0]},
         "iterations must be positive": {"heat_options": [0, 0, 0]},
         "heat needs wants_C": {"wants_C": False, "apic": False},
-        "without gradients": {"resident": False, "thermal": [0, -1, 0], "tables": [ones[:2, None]]},
-        "that expand or melt is computed": {"records": True, "thermal": [0, -1, 0], "tables": [ones[:2, None]]},
         "heat_boundaries must be empty or 3 tensors, got 2": {"heat_boundaries": [none, none]},
         "held_obstacles must be 0 to 0, got 1": {
             "held_obstacles": [1],

@@ -63,16 +63,17 @@ def tables_of_expansion(coefficient: Any) -> Tables | None:
     if coefficient is None:
         return []
     if type(coefficient) is Table:
-        return [(EXPANSION, torch.stack([coefficient.temperature.double(), coefficient.value.detach().double()]))]
+        return [(EXPANSION, torch.stack([coefficient.temperature.double(), coefficient.value.double()]))]
     if callable(coefficient) and not isinstance(coefficient, Tensor):
         return None
-    number = torch.as_tensor(coefficient, dtype=torch.float64).detach()
+    number = torch.as_tensor(coefficient, dtype=torch.float64)
     return [(EXPANSION, torch.stack([number.new_zeros(1), number.reshape(1)]))] if number.numel() == 1 else None
 
 
 def tables_of_parameters(law: CompiledLaw, x: Tensor) -> Tables | None:
     """Tables of the parameters of a compiled law that depend on the temperature, for particles at x [P, D]; None where
-    one is not piecewise linear, or others differ between particles or scenes. Cached while nothing has changed."""
+    one is not piecewise linear, or others differ between particles or scenes. Cached while nothing has changed, unless
+    they are differentiated."""
     if not law.has_functions:
         return []
     given = [value for name, value in law._stored().items() if law._range(name) is not None]
@@ -82,15 +83,16 @@ def tables_of_parameters(law: CompiledLaw, x: Tensor) -> Tables | None:
         return None
     numbers = [value for value in given if isinstance(value, (float, int))]
     contents = [tensor for f in functions for tensor in (f.temperature, f.value)]
+    if torch.is_grad_enabled() and any([t.requires_grad for t in (*others, *contents)]):
+        return _tables_of_functions(law, functions, x)
     key = (x.dtype, x.device, x.shape[1], *numbers, *others, *contents)
     return law._kept_tables.get(key, lambda: _tables_of_functions(law, functions, x), x)
 
 
-@torch.no_grad()
 def _tables_of_functions(law: CompiledLaw, functions: list[Table], x: Tensor) -> Tables | None:
     """Tables of parameters that are computed from functions; None where one is not linear between their knots."""
     dim = x.shape[1]
-    knots = torch.cat([f.temperature.double().cpu() for f in functions]).unique()
+    knots = torch.cat([f.temperature.to(x.device, torch.float64) for f in functions]).unique()
     middles = (knots[1:] + knots[:-1]) / 2
     points = torch.cat([knots, middles])
     rows: Any = Overlay(
@@ -103,12 +105,13 @@ def _tables_of_functions(law: CompiledLaw, functions: list[Table], x: Tensor) ->
             continue
         at_knots, between = values[: len(knots)], values[len(knots) :]
         error = (between - (at_knots[1:] + at_knots[:-1]) / 2).abs().max()
-        if not float(error) <= 1e-12 * float(values.abs().max()):
+        if not bool(error <= 1e-12 * values.abs().max()):
             return None
         tables.append((number, torch.stack([knots, at_knots]).to(x)))
     return tables
 
 
+@torch.no_grad()
 def why_not_thermal(law: Material, x: Tensor, melts: bool) -> str | None:
     """Reason why the fused op does not compute a law that reads the temperature, for particles at x; None if it does.
     `melts`: whether the heat of the step computes liquid fractions."""

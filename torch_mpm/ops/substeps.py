@@ -37,12 +37,12 @@ temperatures of the held obstacles [K, B], two numbers of each term [K, B, 2] (f
 constant of Stefan and Boltzmann; and ambient temperature), and the power of a source [W/m³]; absent ones have the shape
 [0]. The columns of the result `heat` [P, m] are temperature, gradient and liquid fraction; `heat_status` [B, 3] has
 the number of solves that missed the tolerance, their largest residual [K], and the largest diffusion number of
-particles whose liquid fraction changed. With laws that expand or melt, steps are computed without
-gradients, where `resident` is true. Tables have no gradients, and obstacles none beside a held surface.
+particles whose liquid fraction changed.
 
 Where temperatures change, a name in `laws` may be that of a solid and, after a ~, of its liquid, as `Melting` has them.
 `thermal` are records of three numbers: a law, one of its parameters or -1 for the linear expansion of its material or
 -2 for the coherency of a liquid, and one of the `tables` [2, K], increasing temperatures and values; K = 1 is a number.
+The op is differentiable by the values of tables; a coherency has no gradient, and neither have temperatures.
 
     torch.ops.torch_mpm.substeps_with_bodies(bodies, body_shape, body_sizes, body_contact, body_owner, body_joint,
         max_iterations, tolerance, *arguments of substeps) -> (*results of substeps, rows, report)
@@ -64,26 +64,27 @@ Several times a second both ops run the handlers of signals, on the main thread.
 with a RuntimeError and without a result; `torch_mpm.rollout` raises the exception of the handler.
 
 Differentiable once, with respect to x, v, mass, volume, C, F, J, history, parameters, gravity, obstacles, impulse,
-heat, heat_boundaries and scene_dt, the last without FLIP and without the dependence of obstacles on the time. Autograd
-stores the arguments of a call and the record, if any: 2 D + 2 D² numbers per particle of a solid (24 in 3-D) and its
-history.
+heat, heat_boundaries, tables and scene_dt, the last without FLIP and without the dependence of obstacles on the time.
+Autograd stores the arguments of a call and the record, if any: 2 D + 2 D² numbers per particle of a solid (24 in 3-D)
+and its history.
 
     torch.ops.torch_mpm.substeps_backward(grads, needs, record, *arguments of substeps)
         -> (x, v, C, F, J, history, mass, volume, parameters, gravity, obstacles, dt, heat, heat_parameters,
-            heat_boundaries, heat_status)
+            heat_boundaries, heat_status, tables)
 
 recomputes the steps, where there is no record, and then computes their adjoints in reverse order; a record must be that
 of `substeps`, and its contents are not checked. `grads` are the adjoints of the results x, v, C, F, J, history, impulse
 and heat, None where they are zero: one list, since an op has at most 64 arguments. Meanwhile it stores the inputs of
-each step: for a solid 2 D + 3 D² numbers per particle and step (33 in 3-D), D² more where a law is plastic, the history
-and the columns of heat; and the grid of each step where that is at most half as much. The node temperatures of each
-step are solved again where no grid is stored, and those of its adjoint once. The adjoints are [P, ...], those of the
-parameters [P, number of parameters] and that of gravity, over the time step, a sum for each block of the grids of all
-scenes [B * blocks, D]; that of the time step, but for gravity, is [P]. Those of the parameters of heat are [P, 5], in
-the order of conductivity, specific heat, melting point, latent heat and power; `heat_boundaries` [B, m] are those of
-both numbers of each term and of the temperatures of the held obstacles; `heat_status` is that of the adjoint solves.
+each step: for a solid 2 D + 3 D² numbers per particle and step (33 in 3-D), D² more where a law is plastic, 2 D² + 2
+more where one melts, the history and the columns of heat; and the grid of each step where that is at most half as much.
+The node temperatures of each step are solved again where no grid is stored, and those of its adjoint once. The adjoints
+are [P, ...], those of the parameters [P, number of parameters] and that of gravity, over the time step, a sum for each
+block of the grids of all scenes [B * blocks, D]; that of the time step, but for gravity, is [P]. Those of the
+parameters of heat are [P, 5], in the order of conductivity, specific heat, melting point, latent heat and power;
+`heat_boundaries` [B, m] are those of both numbers of each term and of the temperatures of the held obstacles;
+`heat_status` is that of the adjoint solves; `tables` [P, m] are those of the values of all tables one after another.
 The bits of `needs` (`MASS`, `VOLUME`, `PARAMETERS`, `GRAVITY`, `OBSTACLES`, `TIME_STEP`, `HEAT_PARAMETERS`,
-`HEAT_BOUNDARIES`) select among the adjoints from that of mass on.
+`HEAT_BOUNDARIES`, `TABLES`) select among the adjoints from that of mass on.
 """
 
 from __future__ import annotations
@@ -100,7 +101,9 @@ from .autograd import dispatch, register_autograd
 from .free_bodies import fake_bodies
 from .law import _entries, _of_history, _of_parameters
 
-MASS, VOLUME, PARAMETERS, GRAVITY, OBSTACLES, TIME_STEP, HEAT_PARAMETERS, HEAT_BOUNDARIES = (1 << k for k in range(8))
+MASS, VOLUME, PARAMETERS, GRAVITY, OBSTACLES, TIME_STEP, HEAT_PARAMETERS, HEAT_BOUNDARIES, TABLES = (
+    1 << k for k in range(9)
+)
 """Bits of `needs` in csrc/rollout/substeps_backward.op.cpp."""
 
 _SCHEMA = {a.name: str(a.type) for a in torch.ops.torch_mpm.substeps.default._schema.arguments}
@@ -108,8 +111,8 @@ ARGUMENTS = tuple(_SCHEMA)
 """Names of the arguments of `substeps`."""
 _TENSORS = [name for name, kind in _SCHEMA.items() if kind in ("Tensor", "Optional[Tensor]")]
 _ADJOINTS = ("x", "v", "C", "F", "J", "history", "mass", "volume", "parameters", "gravity", "obstacles", "dt", "heat",
-             "heat_parameters", "heat_boundaries", "heat_status")  # fmt: skip
-_LISTS = ("history", "parameters", "heat", "heat_boundaries")
+             "heat_parameters", "heat_boundaries", "heat_status", "tables")  # fmt: skip
+_LISTS = ("history", "parameters", "heat", "heat_boundaries", "tables")
 """Lists of tensors that the op is differentiable by."""
 
 
@@ -190,6 +193,7 @@ def _backward_fake(grads, needs, record, *arguments):
         soa_empty(x, (P, 5)) if needs & HEAT_PARAMETERS and given["heat"] else None,
         x.new_empty((given["scenes"], numbers)) if needs & HEAT_BOUNDARIES and given["heat"] and numbers else None,
         x.new_empty((given["scenes"], 3), dtype=torch.float64) if given["heat"] else None,
+        soa_empty(x, (P, sum(table.shape[1] for table in given["tables"]))) if needs & TABLES else None,
     )
 
 
@@ -217,12 +221,12 @@ def _saved(ctx: Any) -> tuple[Tensor | None, dict[str, Any]]:
 
 def _backward(ctx: Any, *grads: Any) -> Any:
     record, given = _saved(ctx)
-    history, parameters, heat, boundaries = (given[name] for name in _LISTS)
+    history, parameters, heat, boundaries, tables = (given[name] for name in _LISTS)
     wanted = dict(zip(_SCHEMA, ctx.needs_input_grad, strict=True))
     wants_dt = wanted["scene_dt"]
     needs = MASS * wanted["mass"] + VOLUME * wanted["volume"] + GRAVITY * (wanted["gravity"] or wants_dt)
     needs += TIME_STEP * wants_dt + HEAT_PARAMETERS * any([*wanted["heat"], *wanted["heat_boundaries"][2:]])
-    needs += HEAT_BOUNDARIES * any(wanted["heat_boundaries"][:2])
+    needs += HEAT_BOUNDARIES * any(wanted["heat_boundaries"][:2]) + TABLES * any(wanted["tables"])
     needs += PARAMETERS * any(wanted["parameters"]) + OBSTACLES * wanted["obstacles"]
     by_impulse = None if grads[7] is None else grads[7].contiguous()
     arguments = (given[name] for name in _SCHEMA)
@@ -231,7 +235,7 @@ def _backward(ctx: Any, *grads: Any) -> Any:
     found = dict(zip(_ADJOINTS, adjoints, strict=True)) | {"impulse": grads[7]}
     if found["heat_status"] is not None and hasattr(ctx, "report"):
         ctx.report(found["heat_status"])
-    found["tables"] = [None] * len(given["tables"])
+    found["tables"] = _of_tables(found["tables"], tables, wanted["tables"])
     found["history"] = _of_history(found["history"], history, wanted["history"])
     found["parameters"] = _of_parameters(found["parameters"], parameters, wanted["parameters"], given["scene"])
     of_parameters, scene = found["heat_parameters"], given["scene"]
@@ -250,8 +254,7 @@ def _backward(ctx: Any, *grads: Any) -> Any:
         found["gravity"] = dt * change
         if wants_dt:
             found["scene_dt"] = found["scene_dt"] + given["dt"] * (given["gravity"] * change).sum(1)
-    lists = (*_LISTS, "tables")
-    return tuple(found.get(name) if name in lists or wanted[name] is True else None for name in _SCHEMA)
+    return tuple(found.get(name) if name in _LISTS or wanted[name] is True else None for name in _SCHEMA)
 
 
 def _of_heat(
@@ -283,6 +286,14 @@ def _of_boundaries(
     if parameters is not None and wanted[2:] == [True]:
         (grads[2],) = _of_parameters(parameters[:, 4:], given[2:], wanted[2:], scene)
     return grads
+
+
+def _of_tables(by_values: Tensor | None, tables: list[Tensor], wanted: list[bool]) -> list[Tensor | None]:
+    """Gradients of tables [2, K] from those of the values of all tables per particle; none of the temperatures."""
+    if by_values is None:
+        return [None] * len(tables)
+    sums = by_values.sum(0).split([table.shape[1] for table in tables])
+    return [torch.stack([torch.zeros_like(s), s]) if w else None for s, w in zip(sums, wanted, strict=True)]
 
 
 def _no_second_derivatives(ctx: Any, *grads: Any) -> None:

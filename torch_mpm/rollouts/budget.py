@@ -54,5 +54,6 @@ def bytes_of_a_substep(state: State) -> int:
     D, size = state.x.shape[1], state.x.element_size()
     rows = len(state) + (0 if state.x.is_cuda else PADDING // size)
     history = sum(t[0].numel() for t in state.extra.values()) if len(state) else 0
+    both = 0 if state.F is None or state.J is None else 2 + D * D  # J before and after laws that melt, and a stress.
     heat = 0 if state.temperature is None else 2  # With the dissipated energy; its other fields are in `extra`.
-    return rows * (3 * (2 * D + 4 * D * D) // 2 + history + heat) * size
+    return rows * (3 * (2 * D + 4 * D * D) // 2 + both + history + heat) * size

@@ -153,14 +153,6 @@ def wants_gradient(steps: Steps, state: State) -> bool:
     return differentiates(step, state, dt) or _paths_require_grad(steps, state)
 
 
-def obstacles_require_grad(steps: Steps, state: State) -> bool:
-    """Whether a tensor of an obstacle, or one of its positions on a path, requires grad."""
-    step = steps.step
-    assert isinstance(step, Step)
-    tensors = [t for b in _obstacles(step) for t in motion_tensors(b)]
-    return any([t.requires_grad for t in tensors]) or _paths_require_grad(steps, state)
-
-
 def _paths_require_grad(steps: Steps, state: State) -> bool:
     step, n, dt, *_ = steps
     assert isinstance(step, Step)

@@ -19,14 +19,10 @@ from ..heat.boundaries import (
     Source,
 )
 from ..heat.heat import GRADIENT, TRANSFERS, Heat
-from ..laws.calls import laws_of, passive
-from ..laws.parameters import PerMaterial, check_length, evaluate, needed_temperature, tensors_in
+from ..laws.parameters import PerMaterial, check_length, evaluate, needed_temperature
 from ..laws.thermal import LIQUID
-from ..laws.thermal_calls import THERMAL, is_thermal
 from ..state.state import State
 from ..step.step import Step
-from .facts import obstacles_require_grad, wants_gradient
-from .steps import Steps
 
 
 def why_not_fused_heat(step: Step, state: State, n: int, dt: float | Tensor) -> str | None:
@@ -45,23 +41,6 @@ def why_not_fused_heat(step: Step, state: State, n: int, dt: float | Tensor) -> 
         return "it conducts heat with another stress form than mls"
     if any(_is_function(value) for value in heat.parameter_values):
         return "a parameter of its heat is a function"
-    steps = Steps(step, n, dt)
-    if (reason := _why_no_adjoint_of_laws(step)) is not None and wants_gradient(steps, state):
-        return f"{reason}, and a gradient is wanted"
-    surface = any(type(term) is FixedSurface for term in heat.boundaries.entries)
-    if surface and torch.is_grad_enabled() and obstacles_require_grad(steps, state):
-        return "a surface is held at a temperature, and a gradient is wanted by an obstacle"
-    return None
-
-
-def _why_no_adjoint_of_laws(step: Step) -> str | None:
-    """Reason why the op has no gradients of laws that read the temperature; None if it has, where these are tables of
-    constant parameters (`check_heat_has_gradients` in csrc/rollout)."""
-    laws = [law for law in map(passive, laws_of(step.law)) if is_thermal(law)]
-    if any(type(law) in THERMAL for law in laws):
-        return "a law expands or melts"
-    if any(t.requires_grad for law in laws for t in tensors_in(law)):
-        return "a law reads the temperature and has parameters with gradients"
     return None
 
 

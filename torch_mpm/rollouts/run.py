@@ -71,10 +71,9 @@ def rollout(
 
     A `Step` of compiled laws without user functions computes all steps in one op, or in a few calls of it. With heat it
     does so if the boundaries of the heat are held obstacles of the step, sources, or terms of the free surface with
-    constant numbers; laws may expand or melt, or have a `Table` of the temperature among their parameters. Gradients
-    need single steps with laws that expand or melt, by parameters of laws with a `Table`, and by an obstacle beside a
-    `FixedSurface`. `Step.explain` returns the executor, the schedule and the reasons. The results are those of single
-    steps. On CUDA they are bitwise equal, with two exceptions, which round differently, as all steps on a CPU do:
+    constant numbers; laws may expand or melt, or have a `Table` of the temperature among their parameters.
+    `Step.explain` returns the executor, the schedule and the reasons. The results are those of single steps. On CUDA
+    they are bitwise equal, with two exceptions, which round differently, as all steps on a CPU do:
 
     - float32 without gradients;
     - many unsorted particles (`state.ids` is None): for 64 steps or more they are sorted first, and restored to their
