@@ -45,6 +45,15 @@ def test_splats_program_times_runs_with_files(tmp_path: Path) -> None:
 
 
 @pytest.mark.thorough
+def test_environment_program_counts_steps_and_resets(tmp_path: Path) -> None:
+    pytest.importorskip("gymnasium")
+    run_quick_here("benchmarks.speed.envs", tmp_path)
+    (row,) = result(tmp_path, "envs_*.json")["tasks"]
+    assert row["task"] == "Push" and row["failed"] == 0 and row["reset"] > 0
+    assert row["rate"] == pytest.approx(2 / row["step"] * 1e3)
+
+
+@pytest.mark.thorough
 def test_coupling_program_divides_the_time_of_a_step(tmp_path: Path) -> None:
     pytest.importorskip("mujoco.batch")
     run_quick_here("benchmarks.speed.coupling", tmp_path)
