@@ -19,8 +19,8 @@ otherwise. On the CPU the grid is dense, since sparse grids of separate worlds n
 
 What differs: Newton's water is incompressible and its steps are implicit, so that it needs one step where torch_mpm
 needs some twenty; its kernels are linear and those of torch_mpm quadratic, with 8 and 27 nodes per particle; it solves
-the bodies and the water one after another, torch_mpm together; bodies of Newton collide with each other and with the
-floor. Particles, geometry, masses, joints, gravity, cell width and the time of a step are the same.
+the bodies and the water one after another, torch_mpm together. Bodies meet the water alone, not each other. Particles,
+geometry, masses, joints, gravity, cell width and the time of a step are the same.
 """
 
 from __future__ import annotations
@@ -108,21 +108,20 @@ def of_torch_mpm(worlds: int, device: str) -> tuple[Run, Callable[[], dict[str, 
 
 def of_newton(worlds: int, device: str, rigid: str) -> tuple[Run, Callable[[], dict[str, float]]]:
     """As `of_torch_mpm`."""
-    import newton
     import warp as wp
 
+    wp.config.enable_backward = False  # Kernels for gradients take minutes to compile.
     wp.set_device("cuda:0" if device == "cuda" else "cpu")
+    import newton
+
     model = _newton_model(worlds)
     solver, state, control = _newton_solver(model, worlds, device, rigid), model.state(), model.control()
-    pipeline = newton.CollisionPipeline(model, soft_contact_max=0)
-    contacts = pipeline.contacts()
     newton.eval_fk(model, model.joint_q, model.joint_qd, state)
     print(f"newton {newton.__version__}, warp {wp.__version__}, rigid bodies by {rigid}")
 
     def step() -> None:
         state.clear_forces()
-        pipeline.collide(state, contacts)
-        solver.step(state, state, control, contacts, FRAME)
+        solver.step(state, state, control, None, FRAME)
 
     launch: Callable[[], None] = step
     if device == "cuda":
@@ -160,7 +159,7 @@ def _newton_model(worlds: int) -> Any:
     def place(at: Sequence[float]) -> Any:
         return wp.transform(wp.vec3(*at))
 
-    world, wall = builder(), newton.ModelBuilder.ShapeConfig(density=0.0, mu=FRICTION)
+    world, wall = builder(), newton.ModelBuilder.ShapeConfig(density=0.0, mu=FRICTION, has_shape_collision=False)
     inertia = wp.mat33(*(INERTIA * torch.eye(3)).flatten().tolist())
     cup, glass = (world.add_link(mass=MASS, inertia=inertia) for _ in range(2))
     (surface,) = vessel().mesh(np.zeros(3), np.array(UPPER))
@@ -177,7 +176,6 @@ def _newton_model(worlds: int) -> Any:
         world.add_particle(wp.vec3(*x), wp.vec3(0.0), DENSITY * SPACING**3, radius=0.5 * SPACING)
     every = builder()
     every.replicate(world, worlds)
-    every.add_ground_plane()
     model = every.finalize()
     for name, value in {"friction": 0.0, "tensile_yield_ratio": 1.0, "viscosity": 0.0}.items():
         getattr(model.mpm, name).fill_(value)
@@ -199,7 +197,7 @@ def _newton_solver(model: Any, worlds: int, device: str, rigid: str) -> Any:
         config.grid_type = "dense"  # Sparse grids of separate worlds exist on CUDA alone.
 
     def of_bodies(view: Any) -> Any:
-        return SolverMuJoCo(view, use_mujoco_contacts=False, njmax=100) if rigid == "mujoco" else SolverXPBD(view)
+        return SolverMuJoCo(view, njmax=100) if rigid == "mujoco" else SolverXPBD(view)
 
     entry, proxy = SolverCoupledProxy.Entry, SolverCoupledProxy.Proxy
     bodies, joints, particles = (list(range(n)) for n in (model.body_count, model.joint_count, model.particle_count))
