@@ -8,11 +8,12 @@ from pathlib import Path
 import pytest
 
 DOCS = Path(__file__).parent.parent / "docs"
-PACKAGES = {"bodies.md": ["mujoco"], "envs.md": ["gymnasium", "stable_baselines3"]}
+PACKAGES = {"bodies.md": ["mujoco"], "tutorial.md": ["mujoco"], "envs.md": ["gymnasium", "stable_baselines3"]}
 
 
+@pytest.mark.thorough(name="tutorial.md")
 @pytest.mark.filterwarnings("ignore:Anomaly Detection")
-@pytest.mark.parametrize("name", ["training.md", "recipes.md", "splats.md", "bodies.md", "envs.md"])
+@pytest.mark.parametrize("name", ["training.md", "recipes.md", "splats.md", "bodies.md", "envs.md", "tutorial.md"])
 def test_programs_of_a_document(name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     for package in PACKAGES.get(name, []):
         pytest.importorskip(package)

@@ -24,8 +24,13 @@
   standard deviation there. Its
   obstacle is larger by a margin on all sides, where the water starts at the disc itself. The level is that of the
   volume of water away from the disc.
+- Gradients: derivatives through 200 steps of a body in contact with an elastic block (float64), in a direction of each
+  input that is drawn at random, beside central differences. Free: a spinning ball falls on the block; the sum of the
+  numbers of its pose and velocity at the end with different weights, and a loss of the velocities and heights of the
+  particles. Driven: the mean wrench on a ball that moves into the block. Policy: a network of 16, 8 and 3 numbers turns
+  a paddle on a hinge by a torque and moves a disc, with a new action every 10 steps.
 
-Bodies are integrated by semi-implicit Euler, one exchange per interval (docs/bodies.md).
+Bodies but those of the gradients are integrated by semi-implicit Euler, one exchange per interval (docs/bodies.md).
 """
 
 from __future__ import annotations
@@ -45,6 +50,7 @@ from torch import Tensor
 import torch_mpm as mpm
 
 from .. import common
+from . import body_gradients
 from .containers import hydrostatic
 from .limits import angular_momentum
 
@@ -359,7 +365,7 @@ def measure(quick: bool) -> dict[str, Any]:
     begin = time.perf_counter()
     result: dict[str, Any] = {"environment": common.environment("cpu")}
     sand = mpm.QuarticSand(**SAND)
-    cases: dict[str, list[Callable[[], dict[str, Any]]]] = {
+    cases: dict[str, list[Callable[[], Any]]] = {
         "inclines": [lambda a=a, s=s: incline(a, s * math.tan(math.radians(a))) for a, s in INCLINES],
         "momentum": [lambda m=m, k=k: momentum(m, k) for m in LAWS for k in ("separate", "sticky")],
         "jelly": [lambda c=c, a=a: roll(c, a, jelly()) for c, a in ((6, 10), (12, 10), (24, 10), (12, 20))],
@@ -371,9 +377,10 @@ def measure(quick: bool) -> dict[str, Any]:
             for m in (0, 0.75)
             for d, s in ((0.5, -2.0), (0.5, 2.0), (0.8, 2.0))
         ],
+        "gradients": [lambda n=n: list(body_gradients.compared(n)) for n in body_gradients.CASES],
     }
     if quick:
-        cases = {name: cases[name][:1] for name in ("inclines", "momentum", "jelly", "drops")}
+        cases = {name: cases[name][:1] for name in ("inclines", "momentum", "jelly", "drops", "gradients")}
     for name, calls in cases.items():
         result[name] = []
         for call in calls:
@@ -412,6 +419,14 @@ def text(result: dict[str, Any]) -> str:
                     f"{f['spread']:.2f}",
                 )
                 for f in result.get("floating", [])
+            ],
+        ),
+        "Gradients through bodies and material": common.table(
+            ("case", "of", "by", "derivative", "deviation from differences"),
+            [
+                (g["case"], g["of"], g["by"], g["derivative"], f"{g['deviation']:.0e}")
+                for found in result["gradients"]
+                for g in found
             ],
         ),
     }

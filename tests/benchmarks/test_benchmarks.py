@@ -12,7 +12,7 @@ from helpers import result, run_quick, run_quick_here
 
 from benchmarks import common, report
 from benchmarks.accuracy import convergence, manufactured, ritter
-from benchmarks.speed import checkpoints, peers, splats, step, work
+from benchmarks.speed import bodies_newton, checkpoints, peers, splats, step, work
 from benchmarks.stability.stable_dt import LAWS
 from torch_mpm.splats import ply
 
@@ -42,6 +42,30 @@ def test_splats_program_times_runs_with_files(tmp_path: Path) -> None:
         assert run["seconds"] > 0 and run["from_memory"] > 0
     names = [name for name, _ in splats.timed_parts(found)]
     assert len(set(names)) == len(names) == len(splats.PARTS) + 2
+
+
+@pytest.mark.thorough
+def test_environment_program_counts_steps_and_resets(tmp_path: Path) -> None:
+    pytest.importorskip("gymnasium")
+    run_quick_here("benchmarks.speed.envs", tmp_path)
+    (row,) = result(tmp_path, "envs_*.json")["tasks"]
+    assert row["task"] == "Push" and row["failed"] == 0 and row["reset"] > 0
+    assert row["rate"] == pytest.approx(2 / row["step"] * 1e3)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("of", ["torch_mpm", "newton"])
+def test_water_stays_in_a_cup(of: str) -> None:
+    """At the level of its volume within a cell, in torch_mpm; Newton's water is denser in so few cells."""
+    if of == "newton":
+        pytest.importorskip("newton")
+    water = bodies_newton.COUNTS[0] * bodies_newton.COUNTS[1] * bodies_newton.COUNTS[2] * bodies_newton.SPACING**3
+    level = bodies_newton.CUP[2] + 0.5 * water / (math.pi * bodies_newton.RADIUS**2)
+    run, found = bodies_newton.of_newton(2, "cpu", "xpbd") if of == "newton" else bodies_newton.of_torch_mpm(2, "cpu")
+    run(40)
+    least = level - (0.5 if of == "torch_mpm" else 1.5) * bodies_newton.DX
+    assert least < found()["water"] < level + 0.5 * bodies_newton.DX
+    assert found()["cup"] == pytest.approx(0.5, abs=1e-3)
 
 
 @pytest.mark.thorough

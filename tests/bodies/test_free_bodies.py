@@ -337,6 +337,31 @@ def test_gradients_equal_differences(device, joint):
         assert float((grad * way).sum()) == pytest.approx(difference, rel=1e-6, abs=1e-8), k
 
 
+def test_mass_and_inertia_may_be_tensors(dim, device):
+    """They may change between calls, as numbers may."""
+    step, state = material(dim, device)
+    inertia = [1.6] if dim == 2 else [1.2, 1.4, 1.6]
+    number = FreeBodies(step, [Body(mpm.Sphere((0.0,) * dim, BALL), 80.0, inertia)])
+    mass = torch.tensor(8.0, device=device)
+    tensor = FreeBodies(step, [Body(mpm.Sphere((0.0,) * dim, BALL), mass, torch.tensor(inertia, device=device))])
+    place, velocity = (1.03, 1.19, 0.97)[:dim], (0.3, -1.0, 0.2)[:dim]
+    rows = rows_of(dim, place, velocity, [1.0, 2.0, 0.5][: 2 * dim - 3], device)
+    light = tensor.advance(state, rows, 8, 2e-3)[1]
+    mass.fill_(80.0)
+    expected, found = (bodies.advance(state, rows, 8, 2e-3)[1] for bodies in (number, tensor))
+    torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-7)
+    assert not torch.allclose(found, light, rtol=1e-3)
+
+
+def test_masses_of_another_device(device):
+    if device == "cpu":
+        pytest.skip("of CUDA")
+    step, state = material(2, device)
+    bodies = FreeBodies(step, [Body(mpm.Sphere((0.0, 0.0), BALL), torch.tensor(80.0), 1.6)])
+    with pytest.raises(ValueError, match="mass must be on the device of the state"):
+        bodies.advance(state, rows_of(2, (1.0, 1.3), (0.0, 0.0), device=device), 1, 1e-3)
+
+
 @pytest.mark.parametrize(
     ("make", "error"),
     [
@@ -344,6 +369,9 @@ def test_gradients_equal_differences(device, joint):
         (lambda step: FreeBodies(step, [mpm.Sphere((0, 0), 0.1)]), "bodies must be a list of Body"),
         (lambda step: Body(mpm.Sphere((0, 0), 0.1), 0.0, 1.0), "mass must be positive"),
         (lambda step: Body(mpm.Sphere((0, 0), 0.1), 1.0, -1.0), "inertia must be positive"),
+        (lambda step: Body(mpm.Sphere((0, 0), 0.1), torch.tensor(-1.0), 1.0), "mass must be positive"),
+        (lambda step: Body(mpm.Sphere((0, 0), 0.1), torch.ones(2), 1.0), r"mass must have shape \[\], got \[2\]"),
+        (lambda step: Body(mpm.Sphere((0, 0), 0.1), 1.0, torch.ones(2)), r"inertia must have shape .* got \[2\]"),
         (
             lambda step: FreeBodies(step, [Body(mpm.Sphere((0, 0), 0.1), 1.0, (1.0, 1.0, 1.0))]),
             "inertia must be a number",

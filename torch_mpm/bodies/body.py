@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from ..boundaries.obstacles import Obstacle
-from ..errors import check_number, check_vector, shape_of
-from ..geometry.values import filled
+from ..errors import check_vector, shape_of
+from ..geometry.values import filled, positive, shape_of_value
 from .exchange import VELOCITY, Part, parts_of, swirl
 
 NOT_ALLOWED = 1e-5
@@ -101,10 +101,12 @@ class Body:
     Args:
         parts: an obstacle, a `Part`, or a list of these; shapes that the kernel of contact knows. Steps assign their
             position, rotation and velocities.
-        mass: [kg], positive.
+        mass: [kg], positive, a number or a tensor []. Differentiable.
         inertia: moment of inertia about the centre of mass [kg m²], positive: a number in 2-D; in 3-D a number, or
-            three for the axes of the frame.
+            three for the axes of the frame. Or a tensor [], [1] or [3]. Differentiable.
         joint: `Hinge`, `Slider` or `Driven`; None for a free body.
+
+    All scenes have the same mass and inertia. Tensors are on the device of the state, where an `advance` reads them.
 
     Raises:
         TypeError, ValueError: for anything else.
@@ -113,16 +115,14 @@ class Body:
     def __init__(
         self,
         parts: Obstacle | Part | Sequence[Obstacle | Part],
-        mass: float,
-        inertia: float | Sequence[float],
+        mass: float | Tensor,
+        inertia: float | Sequence[float] | Tensor,
         joint: Joint | None = None,
     ) -> None:
         self.parts = parts_of(0, parts)
-        self.mass = float(check_number("mass", mass, "positive and finite", lambda v: 0 < v < math.inf))
-        numbers = inertia if isinstance(inertia, Sequence) else [inertia]
-        self.inertia = tuple(
-            float(check_number("inertia", one, "positive and finite", lambda v: 0 < v < math.inf)) for one in numbers
-        )
+        self.mass = _positive("mass", mass, ((),))
+        moments = _positive("inertia", inertia, ((), (1,), (3,)))
+        self.inertia = moments.reshape(-1) if isinstance(moments, Tensor) else _tuple_of(moments)
         if joint is not None and type(joint) not in (Joint, Hinge, Slider, Driven):
             raise TypeError(f"joint must be a Hinge, a Slider, Driven or None, got {shape_of(joint)}")
         self.joint = joint or Joint()
@@ -157,13 +157,18 @@ class Body:
         """Mass and inertia [B, n, n] by the rotation of the frame [B, D, D], n = 3 in 2-D and 6 in 3-D."""
         count, dim = turn.shape[:2]
         matrix = turn.new_zeros(count, VELOCITY[dim], VELOCITY[dim])
-        matrix[:, range(dim), range(dim)] = self.mass
-        if dim == 2:
-            matrix[:, 2, 2] = self.inertia[0]
-        else:
-            inertia = self.inertia if len(self.inertia) == 3 else self.inertia * 3
-            matrix[:, 3:, 3:] = turn @ torch.diag(filled(inertia, turn)) @ turn.mT
+        matrix[:, range(dim), range(dim)] = self.mass_like(turn)
+        moments = self.moments_like(turn, dim)
+        matrix[:, dim:, dim:] = moments if dim == 2 else turn @ torch.diag(moments) @ turn.mT
         return matrix
+
+    def mass_like(self, like: Tensor) -> Tensor:
+        """Mass [] in float64 on the device of `like`; raises ValueError for a tensor on another one."""
+        return _like("mass", self.mass, like)
+
+    def moments_like(self, like: Tensor, dim: int) -> Tensor:
+        """Moments of inertia [1] (2-D) or [3] (3-D) in float64 on the device of `like`; see `mass_like`."""
+        return _like("inertia", self.inertia, like).expand(1 if dim == 2 else 3)
 
 
 def mobility(matrix: Tensor, directions: Tensor | None) -> Tensor:
@@ -171,6 +176,27 @@ def mobility(matrix: Tensor, directions: Tensor | None) -> Tensor:
     if directions is None:
         return torch.linalg.inv_ex(matrix)[0]
     return directions @ torch.linalg.solve_ex(directions.mT @ matrix @ directions, directions.mT)[0]
+
+
+def _positive(name: str, value: Any, shapes: Sequence[tuple[int, ...]]) -> Any:
+    """Positive numbers of one of some shapes."""
+    value = positive(name, value)
+    if shape_of_value(value) not in shapes:
+        expected = " or ".join(str(list(shape)) for shape in shapes)
+        raise ValueError(f"{name} must have shape {expected}, got {list(shape_of_value(value))}")
+    return value
+
+
+def _tuple_of(value: Any) -> tuple[float, ...]:
+    return value if isinstance(value, tuple) else (value,)
+
+
+def _like(name: str, value: Any, like: Tensor) -> Tensor:
+    if not isinstance(value, Tensor):
+        return filled(value, like, torch.float64)
+    if value.device != like.device:
+        raise ValueError(f"{name} must be on the device of the state, {like.device}, got {value.device}")
+    return value.double()
 
 
 def _unit(name: str, vector: Sequence[float]) -> tuple[float, ...]:

@@ -113,7 +113,8 @@ class FreeBodies:
 
         Returns:
             The state, and poses and velocities as `bodies`, float64. What the material loses the bodies gain, to
-            rounding: linear and, with APIC, angular momentum. Differentiable in the state and `bodies`.
+            rounding: linear and, with APIC, angular momentum. Differentiable in the state, `bodies`,
+            `wrenches`, and tensors of the bodies and the step.
 
         Raises:
             TypeError, ValueError: for wrong arguments.
@@ -217,8 +218,9 @@ class FreeBodies:
         return found if found.dim() == 1 else found[:, None]
 
     def differentiates(self, *tensors: Tensor | None) -> bool:
-        """Whether a gradient by one of the tensors, gravity, or a parameter of the obstacles is wanted."""
+        """Whether a gradient by one of the tensors, gravity, masses, or a parameter of the obstacles is wanted."""
         values = [value for obstacle in self.obstacles for value in values_without_motion(obstacle)]
+        values += [value for body in self.bodies for value in (body.mass, body.inertia)]
         return is_tracked(*[value for value in (*tensors, self.step.gravity, *values) if isinstance(value, Tensor)])
 
     def tables(self, like: Tensor) -> BodyTables:

@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from ..boundaries.motion import rotation_matrix
-from ..geometry.values import filled
 from ..grid.grid import Blocks
 from ..ops.autograd import dispatch
 from ..ops.contact import obstacle_arguments, packed_rows, walls_beside
@@ -52,7 +51,7 @@ class Solution:
         """Velocities at the end of the step without the material [B, K, n]."""
         velocity = self.begin[..., POSE[self.dim] :]
         force = torch.zeros_like(velocity)
-        masses = filled([body.mass for body in self.of.bodies], force)
+        masses = torch.stack([body.mass_like(force) for body in self.of.bodies])
         force[..., : self.dim] = masses[:, None] * self.of.gravity_like(self.begin)
         if self.wrenches is not None:
             force = force + self.wrenches.double()

@@ -12,10 +12,10 @@ from .pour import Pour
 from .push import Push
 from .roll import Roll
 from .scoop import Scoop
-from .vector import MaterialEnv, Scene
+from .vector import MaterialEnv, Scenes
 from .write import Write
 
-__all__ = ["Lift", "MaterialEnv", "Pour", "Push", "Roll", "Scene", "Scoop", "Write"]
+__all__ = ["Lift", "MaterialEnv", "Pour", "Push", "Roll", "Scenes", "Scoop", "Write"]
 
 TASKS: tuple[type[MaterialEnv], ...] = (Push, Roll, Pour, Scoop, Lift, Write)
 

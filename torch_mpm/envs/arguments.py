@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
+import torch
 from torch import Tensor
 
 from .package import AutoresetMode
@@ -23,20 +23,20 @@ def autoreset_mode(given: Any) -> Any:
     return mode
 
 
-def reset_mask(options: dict[str, Any] | None, scenes: int) -> npt.NDArray[np.bool_]:
-    """Scenes to reset, bool [B]: all without options; TypeError, ValueError for other options."""
+def reset_mask(options: dict[str, Any] | None, scenes: int) -> Tensor | None:
+    """Scenes to reset, bool [B]: None for all, without options; TypeError, ValueError for other options."""
     options = {} if options is None else options
     if not isinstance(options, dict):
         raise TypeError(f"options must be a dictionary, got {type(options).__name__}")
     if unknown := sorted(str(key) for key in options if key != MASK):
         raise ValueError(f"options must have the key {MASK!r} only, got {unknown[0]!r}")
     if MASK not in options:
-        return np.ones(scenes, dtype=bool)
+        return None
     given = options[MASK]
-    mask = given.cpu().numpy() if isinstance(given, Tensor) else given
-    if not isinstance(mask, np.ndarray) or mask.dtype != bool or mask.shape != (scenes,):
-        kind = f"{mask.dtype} {list(mask.shape)}" if isinstance(mask, np.ndarray) else type(mask).__name__
-        raise ValueError(f"{MASK} must be bool [B] = [{scenes}], got {kind}")
+    mask = torch.from_numpy(given.copy()) if isinstance(given, np.ndarray) else given
+    if not isinstance(mask, Tensor) or mask.dtype != torch.bool or tuple(mask.shape) != (scenes,):
+        kind = f"{str(mask.dtype).removeprefix('torch.')} {list(mask.shape)}" if isinstance(mask, Tensor) else None
+        raise ValueError(f"{MASK} must be bool [B] = [{scenes}], got {kind or type(mask).__name__}")
     return mask
 
 

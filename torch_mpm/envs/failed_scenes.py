@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
 
-import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -37,14 +35,12 @@ class GradientGate:
         return torch.where(failed.reshape(-1, *(1,) * (gradient.dim() - 1)), 0.0, gradient)
 
 
-def reasons(failures: Failures, failed: npt.NDArray[np.bool_]) -> dict[str, Any]:
-    """Information about scenes that failed, bool [B] on the host; empty without one."""
-    if not failed.any():
-        return {}
-    reason = np.full(len(failed), None, dtype=object)
-    for b in np.flatnonzero(failed):
+def sentences(failures: Failures, failed: Sequence[bool]) -> list[str | None]:
+    """Why scenes failed; None for the others."""
+    problems = (*failures.given.values(), *failures.problems.values())
+    found: list[str | None] = []
+    for b, wrong in enumerate(failed):
         others = [k != b for k in range(len(failed))]
-        problems = (*failures.given.values(), *failures.problems.values())
-        found = [sentence for problem in problems if (sentence := problem.sentence(others))]
-        reason[b] = "; ".join(found) or "the observation or the score is not finite"
-    return {"failed": torch.as_tensor(failed, device=failures.failed.device), "reason": reason, "_reason": failed}
+        parts = [sentence for problem in problems if wrong and (sentence := problem.sentence(others))]
+        found.append("; ".join(parts) or "the observation, the score or a pose is not finite" if wrong else None)
+    return found

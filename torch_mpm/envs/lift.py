@@ -15,7 +15,7 @@ from ..grid.grid import Grid
 from ..laws import NeoHookean
 from ..state.state import State
 from ..step.step import Step
-from .vector import MaterialEnv, Scene
+from .vector import MaterialEnv, Scenes
 
 UPPER = (0.72, 0.36, 0.48)  # of the domain from the origin [m]
 SIDE, FINGER = 0.12, (0.12, 0.12, 0.12)  # of the cube, and of a finger [m]
@@ -44,7 +44,7 @@ class Lift(MaterialEnv):
         options: see `MaterialEnv`.
     """
 
-    ACTIONS, OBSERVATIONS, MAX_EPISODE_STEPS = 3, 13, 60
+    ACTIONS, OBSERVATIONS, RANDOM, MAX_EPISODE_STEPS = 3, 13, 2, 60
     SPEED, APPROACH, NEAR, SLOW = 0.5, 0.1, 0.01, 0.1
 
     def __init__(self, num_envs: int = 1, dx: float = 0.03, **options: Any) -> None:
@@ -55,13 +55,16 @@ class Lift(MaterialEnv):
         step = Step(self.grid, NeoHookean(E=3e4, nu=0.3), gravity=(0.0, 0.0, -9.81), walls=walls, boundaries=fingers)
         super().__init__(step, fingers, substeps=round(0.6 / dx), dt=dx / 30, **options)
 
-    def scene(self, random: np.random.Generator) -> Scene:
-        state = State.at_rest(self.points, density=1000.0, dtype=self.dtype, device=self.device)
-        centre, y = 0.5 * UPPER[0] + random.uniform(-0.03, 0.03), 0.5 * UPPER[1]
-        state = state.replace(x=state.x + state.x.new_tensor([centre - 0.5 * SIDE, y - 0.5 * SIDE, 0.0]))
+    def particles(self) -> State:
+        return State.at_rest(self.points, density=1000.0, dtype=self.dtype, device=self.device)
+
+    def scenes(self, random: Tensor) -> Scenes:
+        centre, y = 0.5 * UPPER[0] - 0.03 + 0.06 * random[:, 0], 0.5 * UPPER[1]
         apart = 0.5 * (SIDE + FINGER[0]) + 0.01
-        poses = [(centre + side * apart, y, 0.5 * FINGER[2], 1.0, 0.0, 0.0, 0.0) for side in (-1, 1)]
-        return Scene(state, poses, [random.uniform(0.15, 0.25)])
+        rest = y, 0.5 * FINGER[2], 1.0, 0.0, 0.0, 0.0
+        poses = torch.stack([self.columns(centre + side * apart, *rest) for side in (-1, 1)], 1)
+        goal = self.columns(0.15 + 0.1 * random[:, 1])
+        return Scenes(poses, goal, self.shifted(centre - 0.5 * SIDE, y - 0.5 * SIDE, 0.0))
 
     def velocities(self, actions: Tensor) -> Tensor:
         zero = torch.zeros_like(actions[:, :2])

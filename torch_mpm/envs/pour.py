@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -14,12 +13,12 @@ from ..grid.grid import Grid
 from ..laws import WeaklyCompressible
 from ..state.state import State
 from ..step.step import Step
-from .vector import MaterialEnv, Scene
+from .vector import MaterialEnv, Scenes
 from .vessel import THICK, vessel
 
 UPPER = (1.6, 1.2)  # of the domain from the origin [m]
 WIDTH, DEPTH, LEVEL = 0.24, 0.24, 0.16  # inside of the cup and of the glass, and height of the water in the cup [m]
-HEIGHT = 0.75  # of the bottom of the cup at first [m]
+LEFT, HEIGHT = 0.5, 0.75  # of the middle of the bottom of the cup at first [m]
 LOWEST, HIGHEST = (0.4, 0.6), (1.2, 0.9)  # positions of the cup [m]
 
 
@@ -43,7 +42,7 @@ class Pour(MaterialEnv):
         options: see `MaterialEnv`.
     """
 
-    ACTIONS, OBSERVATIONS, MAX_EPISODE_STEPS = 3, 9, 120
+    ACTIONS, OBSERVATIONS, RANDOM, MAX_EPISODE_STEPS = 3, 9, 1, 120
     SPEED, SPIN, FULL = 0.5, 2.0, 0.9
 
     def __init__(self, num_envs: int = 1, dx: float = 0.03, **options: Any) -> None:
@@ -60,11 +59,13 @@ class Pour(MaterialEnv):
         )
         super().__init__(step, [cup, glass], substeps=round(0.9 / dx), dt=dx / 45, **options)
 
-    def scene(self, random: np.random.Generator) -> Scene:
-        state = State.at_rest(self.points, density=1000.0, dtype=self.dtype, device=self.device)
-        left, glass = 0.5, random.uniform(0.9, 1.1)
-        state = state.replace(x=state.x + state.x.new_tensor([left - 0.5 * WIDTH, HEIGHT]))
-        return Scene(state, [(left, HEIGHT, 0.0), (glass, self.thick, 0.0)])
+    def particles(self) -> State:
+        return State.at_rest(self.points, density=1000.0, dtype=self.dtype, device=self.device)
+
+    def scenes(self, random: Tensor) -> Scenes:
+        cup = self.columns(LEFT, HEIGHT, 0.0)
+        glass = self.columns(0.9 + 0.2 * random[:, 0], self.thick, 0.0)
+        return Scenes(torch.stack([cup, glass], 1), fields=self.shifted(LEFT - 0.5 * WIDTH, HEIGHT))
 
     def velocities(self, actions: Tensor) -> Tensor:
         glass = torch.zeros_like(actions)
@@ -76,8 +77,7 @@ class Pour(MaterialEnv):
     def distances(self) -> Tensor:
         """Distances of the particles from the inside of the glass [B, R] [m]; zero for absent ones."""
         from_bottom = self.envs.observe("x") - self.positions[:, 1, None]
-        middle = torch.tensor([0.0, 0.5 * DEPTH], dtype=self.dtype, device=self.device)
-        half = torch.tensor([0.5 * WIDTH, 0.5 * DEPTH], dtype=self.dtype, device=self.device)
+        middle, half = self.constant((0.0, 0.5 * DEPTH)), self.constant((0.5 * WIDTH, 0.5 * DEPTH))
         outside = ((from_bottom - middle).abs() - half).clamp_min(0.0)
         return torch.where(self.envs.present, norm(outside), 0.0)
 

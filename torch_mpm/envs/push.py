@@ -15,7 +15,7 @@ from ..grid.grid import Grid
 from ..laws import NeoHookean
 from ..state.state import State
 from ..step.step import Step
-from .vector import MaterialEnv, Scene
+from .vector import MaterialEnv, Scenes
 
 UPPER = (1.2, 0.6)  # of the domain from the origin [m]
 SIDE, RADIUS = 0.2, 0.1  # of the lump and of the disc that pushes it [m]
@@ -43,7 +43,7 @@ class Push(MaterialEnv):
         options: see `MaterialEnv`.
     """
 
-    ACTIONS, OBSERVATIONS, MAX_EPISODE_STEPS = 2, 7, 40
+    ACTIONS, OBSERVATIONS, RANDOM, MAX_EPISODE_STEPS = 2, 7, 2, 40
     SPEED, APPROACH, NEAR, SLOW = 1.0, 0.1, 0.02, 0.1
 
     def __init__(self, num_envs: int = 1, dx: float = 0.05, **options: Any) -> None:
@@ -54,11 +54,13 @@ class Push(MaterialEnv):
         step = Step(self.grid, NeoHookean(E=2e4, nu=0.3), gravity=(0.0, -9.81), walls=walls, boundaries=[disc])
         super().__init__(step, [disc], substeps=round(1.0 / dx), dt=0.04 * dx, **options)
 
-    def scene(self, random: np.random.Generator) -> Scene:
-        state = State.at_rest(self.points, density=1000.0, dtype=self.dtype, device=self.device)
-        left = random.uniform(0.3, 0.4)
-        state = state.replace(x=state.x + state.x.new_tensor([left, 0.0]))
-        return Scene(state, [(left - 1.1 * RADIUS, RADIUS, 0.0)], [left + 0.5 * SIDE + random.uniform(0.2, 0.4)])
+    def particles(self) -> State:
+        return State.at_rest(self.points, density=1000.0, dtype=self.dtype, device=self.device)
+
+    def scenes(self, random: Tensor) -> Scenes:
+        left, way = 0.3 + 0.1 * random[:, 0], 0.2 + 0.2 * random[:, 1]
+        poses = self.columns(left - 1.1 * RADIUS, RADIUS, 0.0)[:, None]
+        return Scenes(poses, self.columns(left + 0.5 * SIDE + way), self.shifted(left, 0.0))
 
     def velocities(self, actions: Tensor) -> Tensor:
         velocity = self.within(self.SPEED * actions[:, None], LOWEST, HIGHEST)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -14,7 +13,7 @@ from ..grid.grid import Grid
 from ..laws import VonMises
 from ..state.state import State
 from ..step.step import Step
-from .vector import MaterialEnv, Scene
+from .vector import MaterialEnv, Scenes
 
 UPPER = (1.2, 0.6)  # of the domain from the origin [m]
 WIDTH, HEIGHT, RADIUS = 0.3, 0.2, 0.1  # of the dough and of the roller [m]
@@ -42,7 +41,7 @@ class Roll(MaterialEnv):
         options: see `MaterialEnv`.
     """
 
-    ACTIONS, OBSERVATIONS, MAX_EPISODE_STEPS = 2, 8, 100
+    ACTIONS, OBSERVATIONS, RANDOM, MAX_EPISODE_STEPS = 2, 8, 1, 100
     SPEED, FLAT = 1.0, 0.12
 
     def __init__(self, num_envs: int = 1, dx: float = 0.04, **options: Any) -> None:
@@ -53,11 +52,13 @@ class Roll(MaterialEnv):
         step = Step(self.grid, law, gravity=(0.0, -9.81), walls=Walls("sticky"), boundaries=[roller])
         super().__init__(step, [roller], substeps=round(1.2 / dx), dt=dx / 30, **options)
 
-    def scene(self, random: np.random.Generator) -> Scene:
-        state = State.at_rest(self.points, density=1000.0, dtype=self.dtype, device=self.device)
-        left = random.uniform(0.4, 0.5)
-        state = state.replace(x=state.x + state.x.new_tensor([left, 0.0]))
-        return Scene(state, [(left + 0.5 * WIDTH, HEIGHT + 1.1 * RADIUS, 0.0)])
+    def particles(self) -> State:
+        return State.at_rest(self.points, density=1000.0, dtype=self.dtype, device=self.device)
+
+    def scenes(self, random: Tensor) -> Scenes:
+        left = 0.4 + 0.1 * random[:, 0]
+        poses = self.columns(left + 0.5 * WIDTH, HEIGHT + 1.1 * RADIUS, 0.0)[:, None]
+        return Scenes(poses, fields=self.shifted(left, 0.0))
 
     def velocities(self, actions: Tensor) -> Tensor:
         velocity = self.within(self.SPEED * actions[:, None], LOWEST, HIGHEST)

@@ -15,7 +15,7 @@ from ..grid.grid import Grid
 from ..laws import QuarticSand
 from ..state.state import State
 from ..step.step import Step
-from .vector import MaterialEnv, Scene
+from .vector import MaterialEnv, Scenes
 from .vessel import THICK, vessel
 
 UPPER = (1.6, 1.2)  # of the domain from the origin [m]
@@ -45,7 +45,7 @@ class Scoop(MaterialEnv):
         options: see `MaterialEnv`.
     """
 
-    ACTIONS, OBSERVATIONS, MAX_EPISODE_STEPS = 3, 8, 120
+    ACTIONS, OBSERVATIONS, RANDOM, MAX_EPISODE_STEPS = 3, 8, 1, 120
     SPEED, SPIN, LIFTED = 0.5, 2.0, 0.03
 
     def __init__(self, num_envs: int = 1, dx: float = 0.025, **options: Any) -> None:
@@ -58,9 +58,11 @@ class Scoop(MaterialEnv):
         step = Step(self.grid, sand, gravity=(0.0, -9.81), walls=walls, boundaries=obstacles)
         super().__init__(step, [bucket], substeps=round(1.6 / dx), dt=dx / 80, **options)
 
-    def scene(self, random: np.random.Generator) -> Scene:
-        state = State.at_rest(self.points, density=1600.0, dtype=self.dtype, device=self.device)
-        return Scene(state, [(random.uniform(0.4, 0.6), 0.6, -0.5 * math.pi)])
+    def particles(self) -> State:
+        return State.at_rest(self.points, density=1600.0, dtype=self.dtype, device=self.device)
+
+    def scenes(self, random: Tensor) -> Scenes:
+        return Scenes(self.columns(0.4 + 0.2 * random[:, 0], 0.6, -0.5 * math.pi)[:, None])
 
     def velocities(self, actions: Tensor) -> Tensor:
         velocity = self.within(self.SPEED * actions[:, None, :2], LOWEST, HIGHEST)

@@ -61,13 +61,14 @@ class StableBaselinesEnv(VecEnv):
         """Observations [B, O], rewards [B], ends of episodes bool [B], and a dictionary for each scene."""
         observation, reward, terminated, truncated, info = self.env.step(self._actions)
         ended = terminated | truncated
+        reasons = self.env.failure_reasons() if info["failed"].any() else [None] * self.num_envs
         infos: list[dict[str, Any]] = [{} for _ in ended]
         for b in np.flatnonzero(ended):
             infos[b]["terminal_observation"] = observation[b]
             infos[b]["TimeLimit.truncated"] = bool(truncated[b])
             infos[b]["is_success"] = bool(info["success"][b])
-            if "failed" in info and info["failed"][b]:
-                infos[b]["reason"] = info["reason"][b]
+            if reasons[b] is not None:
+                infos[b]["reason"] = reasons[b]
         if ended.any():
             observation, _ = self.env.reset(options={"reset_mask": ended})
         return observation, reward, ended, infos

@@ -5,40 +5,50 @@ A task is a subclass of `MaterialEnv` with a scene, the motion of its bodies, ob
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from ..bodies.exchange import POSE, VELOCITY, Part, RigidBodies, moved
 from ..boundaries.obstacles import Obstacle
+from ..cuda_graphs.capture import is_readable
 from ..errors import FLOATING, check_count, check_flag, check_number, default_dtype, shape_of
 from ..rollouts.environments import Environments
 from ..state.state import State
+from ..step.failures import Failures
 from ..step.step import Step
 from .arguments import autoreset_mode as check_autoreset_mode
 from .arguments import reset_mask, seeds_of_scenes
-from .failed_scenes import GradientGate, reasons
+from .failed_scenes import GradientGate, sentences
 from .package import AutoresetMode, gymnasium
 from .pictures import Pictures
+from .random_numbers import uniform
 
 
-class Scene(NamedTuple):
-    """First state of a scene, first poses of its K bodies (K rows of 3 or 7 numbers), and numbers of its goal."""
+class Scenes(NamedTuple):
+    """How B scenes begin.
 
-    state: State
-    poses: Sequence[Sequence[float]]
-    goal: Sequence[float] = ()
+    Attributes:
+        poses: poses of the K bodies [B, K, 3] (2-D) or [B, K, 7] (3-D).
+        goal: numbers of the goals [B, G]; None for no numbers.
+        fields: fields of the particles that differ from those of `MaterialEnv.particles`, by name [B, R, ...].
+    """
+
+    poses: Tensor
+    goal: Tensor | None = None
+    fields: Mapping[str, Tensor] = {}
 
 
 class MaterialEnv(gymnasium.vector.VectorEnv):
     """B scenes of a task; the base class of tasks.
 
-    A subclass makes a step, and defines `scene`, `velocities`, `observation`, `score`, and perhaps `reward` and
-    `success`. Its class attributes are the numbers of an action and of an observation, and the default limit of time.
+    A subclass makes a step, and defines `particles`, `scenes`, `velocities`, `observation`, `score`, and perhaps
+    `reward` and `success`. Its class attributes are the numbers of an action and of an observation, the number of
+    random numbers of a scene, and the default limit of time. On CUDA neither `step` nor `reset` waits for the device,
+    unless the results are arrays.
 
     Args:
         step: step of a grid of B scenes.
@@ -70,6 +80,7 @@ class MaterialEnv(gymnasium.vector.VectorEnv):
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
     ACTIONS: ClassVar[int]
     OBSERVATIONS: ClassVar[int]
+    RANDOM: ClassVar[int] = 0
     MAX_EPISODE_STEPS: ClassVar[int]
 
     def __init__(
@@ -121,23 +132,33 @@ class MaterialEnv(gymnasium.vector.VectorEnv):
 
     def _make_scenes(self) -> None:
         """All scenes from the same seed, until the first reset."""
-        first = self.scene(np.random.default_rng(0))
         B, device = self.num_envs, self.device
-        self.envs = Environments(self.bodies.step, [first.state] * B)
-        self.poses = torch.tensor([first.poses] * B, dtype=torch.float64, device=device)
-        self.poses = self.poses.reshape(B, len(self.bodies), POSE[self.dim])
-        self.goal = torch.tensor([first.goal] * B, dtype=self.dtype, device=device)
-        self.steps = torch.zeros(B, dtype=torch.int64, device=device)
+        self._constants: dict[tuple[Any, torch.dtype], Tensor] = {}
+        self.first = self.particles()
+        self.envs = Environments(self.bodies.step, [self.first] * B)
+        self.seeds, self.episodes, self.steps = (torch.zeros(B, dtype=torch.int64, device=device) for _ in range(3))
+        made = self._drawn()
+        self.poses = torch.zeros_like(made.poses, dtype=torch.float64)
+        self.goal = self.poses.new_zeros(B, 0, dtype=self.dtype) if made.goal is None else torch.zeros_like(made.goal)
         self.terminated, self.truncated = (torch.zeros(B, dtype=torch.bool, device=device) for _ in range(2))
         self._observation = torch.zeros(B, self.OBSERVATIONS, dtype=self.dtype, device=device)
         self._score = torch.zeros(B, dtype=self.dtype, device=device)
-        self._random: list[Any] = [None] * B
+        self._failures: tuple[Failures, Tensor] | None = None
         self._began = False
+        with torch.no_grad():
+            self._replace(torch.ones_like(self.terminated))
 
     # ---- what a task defines
 
-    def scene(self, random: np.random.Generator) -> Scene:
-        """A scene from a random generator, in `dtype` and on `device`; all with the same number of particles."""
+    def particles(self) -> State:
+        """The R particles of a scene, in `dtype` and on `device`."""
+        raise NotImplementedError
+
+    def scenes(self, random: Tensor) -> Scenes:
+        """How the scenes begin by random numbers from 0 to 1 [B, RANDOM], float64, by operations on the device.
+
+        `first` are the particles of `particles`. Row b must depend on row b of the numbers alone.
+        """
         raise NotImplementedError
 
     def velocities(self, actions: Tensor) -> Tensor:
@@ -169,6 +190,22 @@ class MaterialEnv(gymnasium.vector.VectorEnv):
 
     # ---- parts for tasks
 
+    def constant(self, numbers: Any, dtype: torch.dtype | None = None) -> Tensor:
+        """A number, or nested tuples of numbers, as a tensor on `device`, which is made once; in `dtype` by default."""
+        key = numbers, self.dtype if dtype is None else dtype
+        if key not in self._constants:
+            self._constants[key] = torch.tensor(numbers, dtype=key[1], device=self.device)
+        return self._constants[key]
+
+    def columns(self, *values: Tensor | float) -> Tensor:
+        """Tensors [B] and numbers side by side [B, n], float64."""
+        rows = [v.double() if isinstance(v, Tensor) else self.constant(v, torch.float64) for v in values]
+        return torch.stack([row.expand(self.num_envs) for row in rows], 1)
+
+    def shifted(self, *offset: Tensor | float) -> dict[str, Tensor]:
+        """The positions of the particles of `first` by an offset of D tensors [B] or numbers [m], for `Scenes`."""
+        return {"x": self.first.x + self.columns(*offset).to(self.dtype)[:, None]}
+
     @property
     def dim(self) -> int:
         return self.bodies.step.grid.dim
@@ -197,7 +234,7 @@ class MaterialEnv(gymnasium.vector.VectorEnv):
     def within(self, velocity: Tensor, lower: Sequence[float], upper: Sequence[float]) -> Tensor:
         """Velocities [B, K, D] limited so that the positions of the bodies stay within a box at the end of the step."""
         now = self.poses[..., : self.dim]
-        low, high = (torch.tensor(corner, dtype=now.dtype, device=now.device) for corner in (lower, upper))
+        low, high = (self.constant(tuple(corner), now.dtype) for corner in (lower, upper))
         later = now + self.seconds * velocity.to(now)
         return (torch.minimum(torch.maximum(later, low), high) - now) / self.seconds
 
@@ -212,7 +249,7 @@ class MaterialEnv(gymnasium.vector.VectorEnv):
             seed: scene b gets seed + b, or seed[b] of a list; the same scene whatever the others are. None continues
                 the random numbers of each scene.
             options: {"reset_mask": bool [B], a tensor or an array} resets these scenes only; the others are unchanged,
-                bit by bit.
+                bit by bit. A reset without a mask ends all gradients.
 
         Returns:
             Observations [B, O], and an empty dictionary.
@@ -220,14 +257,15 @@ class MaterialEnv(gymnasium.vector.VectorEnv):
         Raises:
             TypeError, ValueError: for another seed, another option, or a mask of another shape or dtype.
         """
-        which = reset_mask(options, self.num_envs)
-        if not self._began and not which.all():
+        mask = reset_mask(options, self.num_envs)
+        if not self._began and mask is not None:
             raise RuntimeError("reset must be called without a mask before the first reset with one")
+        which = torch.ones_like(self.terminated) if mask is None else mask.to(self.device, non_blocking=True)
         self._seed(seed, which)
-        if which.all():
+        if mask is None:
             self.detach()
         with torch.set_grad_enabled(self._has_graph()):
-            self._replace(which)
+            self._begin(which)
         self._began = True
         return self._given(self._observation), {}
 
@@ -238,15 +276,14 @@ class MaterialEnv(gymnasium.vector.VectorEnv):
             actions: [B, A], a tensor or an array; clamped to [-1, 1], so that the gradient outside is zero.
 
         Returns:
-            Observations [B, O], rewards [B], terminated and truncated bool [B], and a dictionary: "success" bool [B];
-            where scenes failed also "failed" bool [B] and, as arrays on the host, "reason" (texts or None) and
-            "_reason" (where there is one). A scene fails where particles leave the grid, are not finite or are
-            inverted, or where its observation or score is not finite. Its episode terminates with the observation of
-            the step before and a reward of 0.
+            Observations [B, O], rewards [B], terminated and truncated bool [B], and a dictionary: "success" and
+            "failed", bool [B]. A scene fails where particles leave the grid, are not finite or are inverted, or where
+            its observation, its score or a pose is not finite. Its episode terminates with the observation of the step
+            before and a reward of 0. `failure_reasons` has the reasons.
 
         Raises:
-            TypeError, ValueError: for other actions, for ones that are not finite, or that require a gradient where the
-                environment is not differentiable.
+            TypeError, ValueError: for other actions, for ones that require a gradient where the environment is not
+                differentiable, and on the CPU for ones that are not finite; on CUDA their scenes fail.
             RuntimeError: before the first reset.
         """
         if not self._began:
@@ -256,11 +293,18 @@ class MaterialEnv(gymnasium.vector.VectorEnv):
             before = self.ended
             self._advance(actions)
             reward, info = self._judge(actions)
-            if self.autoreset is AutoresetMode.NEXT_STEP:
-                self._replace(before.cpu().numpy())
+            if self.autoreset is AutoresetMode.NEXT_STEP and _may_have_some(before):
+                self._begin(before)
         results = (self._observation, reward, self.terminated, self.truncated)
         observation, reward, terminated, truncated = (self._given(value) for value in results)
         return observation, reward, terminated, truncated, {key: self._given(value) for key, value in info.items()}
+
+    def failure_reasons(self) -> list[str | None]:
+        """For each scene why it failed in the latest step, None where it did not; waits for the device."""
+        if self._failures is None:
+            return [None] * self.num_envs
+        failures, failed = self._failures
+        return sentences(failures, failed.tolist())
 
     def detach(self) -> None:
         """Cut the gradient here: later rewards have none by earlier actions, whose memory is freed."""
@@ -286,33 +330,45 @@ class MaterialEnv(gymnasium.vector.VectorEnv):
 
     # ---- episodes
 
-    def _seed(self, seed: Any, which: npt.NDArray[np.bool_]) -> None:
-        """Choose the random numbers of the scenes of a mask."""
-        seeds, make = seeds_of_scenes(seed, self.num_envs), gymnasium.utils.seeding.np_random
+    def _seed(self, seed: Any, which: Tensor) -> None:
+        """Choose the random numbers of the scenes of a mask bool [B]."""
+        seeds = seeds_of_scenes(seed, self.num_envs)
         super().reset(seed=None if isinstance(seed, Sequence) else seeds[0])
-        for b in np.flatnonzero(which).tolist():
-            given = seeds[b]
-            if given is None and self._random[b] is None:
-                given = int(self.np_random.integers(2**31))
-            if given is not None:
-                self._random[b] = make(given)[0]
-
-    def _replace(self, which: npt.NDArray[np.bool_]) -> None:
-        """Begin new episodes in the scenes of a mask bool [B]."""
-        scenes = [self.scene(self._random[b]) for b in np.flatnonzero(which).tolist()]
-        if not scenes:
+        if not self._began:
+            first = int(self.np_random.integers(2**31))
+            seeds = [first + b if own is None else own for b, own in enumerate(seeds)]
+        if all(own is None for own in seeds):
             return
-        index = torch.as_tensor(np.flatnonzero(which), device=self.device)
-        self.envs.reset(index, [scene.state for scene in scenes])
-        for name, rows in (("poses", [s.poses for s in scenes]), ("goal", [s.goal for s in scenes])):
-            old = getattr(self, name)
-            new = torch.tensor(rows, dtype=old.dtype, device=self.device).reshape(len(scenes), *old.shape[1:])
-            setattr(self, name, old.index_copy(0, index, new))
+        given = torch.tensor([-1 if own is None else own for own in seeds]).to(self.device, non_blocking=True)
+        chosen = which & (given >= 0)
+        self.seeds = torch.where(chosen, given, self.seeds)
+        self.episodes = torch.where(chosen, -1, self.episodes)  # `_replace` counts the episode.
+
+    def _drawn(self) -> Scenes:
+        """How the present episodes of all scenes begin; poses in float64, goals and fields in `dtype`."""
+        made = self.scenes(uniform(self.seeds, self.episodes, self.RANDOM))
+        shape = self.num_envs, len(self.bodies), POSE[self.dim]
+        if tuple(made.poses.shape) != shape:
+            raise ValueError(f"poses of scenes must have shape {list(shape)}, got {shape_of(made.poses)}")
+        goal = None if made.goal is None else made.goal.to(self.dtype)
+        return Scenes(made.poses.double(), goal, {name: value.to(self.dtype) for name, value in made.fields.items()})
+
+    def _begin(self, which: Tensor) -> None:
+        """Begin new episodes in the scenes of a mask bool [B]."""
+        self._replace(which)
+        self._observation = torch.where(which[:, None], self.observation(), self._observation)
+        self._score = torch.where(which, self.score(), self._score)
+
+    def _replace(self, which: Tensor) -> None:
+        """Replace the scenes of a mask bool [B]. All scenes are drawn, because reading the mask would wait for it."""
+        self.episodes = self.episodes + which
+        made = self._drawn()
+        self.envs.reset(which, self.envs.first.replace(**{n: v.flatten(0, 1) for n, v in made.fields.items()}))
+        self.poses = torch.where(which[:, None, None], made.poses, self.poses)
+        if made.goal is not None:
+            self.goal = torch.where(which[:, None], made.goal, self.goal)
         for name in ("steps", "terminated", "truncated"):
-            setattr(self, name, getattr(self, name).index_fill(0, index, 0))
-        mask = torch.zeros_like(self.terminated).index_fill(0, index, True)
-        self._observation = torch.where(mask[:, None], self.observation(), self._observation)
-        self._score = torch.where(mask, self.score(), self._score)
+            setattr(self, name, getattr(self, name).masked_fill(which, 0))
 
     def _place(self) -> None:
         """Put the bodies at their poses, at rest."""
@@ -333,24 +389,28 @@ class MaterialEnv(gymnasium.vector.VectorEnv):
         """Rewards [B] and information of a step, after which scenes that have ended stand still."""
         ended, failures = self.ended, self.bodies.step.failures(self.envs.state)
         failed = failures.failed & ~ended
-        if failed.any():  # Before observations: zero times the gradient of a scene without a result is NaN.
-            self.envs.freeze(failed)
+        self._freeze(failed)  # Before observations: zero times the gradient of a scene without a result is NaN.
         observation, score = self.observation(), self.score()
-        undefined = ~(observation.isfinite().all(1) & score.isfinite() | ended | failed)
-        self._gate.failed = failed | undefined
-        held = ended | failed | undefined
+        defined = observation.isfinite().all(1) & score.isfinite() & self.poses.isfinite().flatten(1).all(1)
+        failed = failed | ~(defined | ended)
+        self._gate.failed = failed
+        held = ended | failed
         observation = torch.where(held[:, None], self._observation, observation)
         score = torch.where(held, self._score, score)
         reward = torch.where(held, 0.0, self.reward(score - self._score, actions))
         success = self.success() & ~held
-        terminated = torch.where(ended, self.terminated, success | failed | undefined)
+        terminated = torch.where(ended, self.terminated, success | failed)
         truncated = torch.where(ended, self.truncated, ~terminated & (self.steps >= self.max_episode_steps))
         self._observation, self._score = observation, score
         self.terminated, self.truncated = terminated, truncated
-        if (self.ended & ~ended).any():
-            self.envs.freeze(self.ended)
-        info = {"success": success} | reasons(failures, (failed | undefined).cpu().numpy())
-        return reward, info
+        self._freeze(self.ended & ~ended)
+        self._failures = failures, failed
+        return reward, {"success": success, "failed": failed}
+
+    def _freeze(self, which: Tensor) -> None:
+        """Let scenes of a mask bool [B] stand still."""
+        if _may_have_some(which):
+            self.envs.freeze(which)
 
     # ---- arguments and results
 
@@ -370,6 +430,11 @@ class MaterialEnv(gymnasium.vector.VectorEnv):
         values = torch.as_tensor(actions).to(self.device, self.dtype)
         if values.requires_grad and torch.is_grad_enabled() and not self.differentiable:
             raise ValueError("actions must not require grad where differentiable is False: detach them")
-        if not values.isfinite().all():
+        if is_readable(values) and not bool(values.isfinite().all()):
             raise ValueError("actions must be finite, got NaN or infinity")
         return values.clamp(-1.0, 1.0)
+
+
+def _may_have_some(mask: Tensor) -> bool:
+    """Whether a mask has an entry that is true; it may have one where it cannot be read without waiting."""
+    return not is_readable(mask) or bool(mask.any())

@@ -15,7 +15,7 @@ from ..grid.grid import Grid
 from ..laws import VonMises
 from ..state.state import State
 from ..step.step import Step
-from .vector import MaterialEnv, Scene
+from .vector import MaterialEnv, Scenes
 
 UPPER = (0.8, 0.8, 0.5)  # of the domain from the origin [m]
 CLAY = 0.12  # height of the clay, which covers the floor [m]
@@ -55,7 +55,7 @@ class Write(MaterialEnv):
         options: see `MaterialEnv`.
     """
 
-    ACTIONS, OBSERVATIONS, MAX_EPISODE_STEPS = 3, 4 + 2 * CORNERS, 100
+    ACTIONS, OBSERVATIONS, RANDOM, MAX_EPISODE_STEPS = 3, 4 + 2 * CORNERS, 3, 100
     SPEED, FREE = 1.0, 0.4
 
     def __init__(self, num_envs: int = 1, dx: float = 0.04, **options: Any) -> None:
@@ -66,15 +66,16 @@ class Write(MaterialEnv):
         step = Step(self.grid, clay, gravity=(0.0, 0.0, -9.81), walls=Walls("sticky"), boundaries=[stylus])
         super().__init__(step, [stylus], substeps=round(0.8 / dx), dt=dx / 40, **options)
 
-    def scene(self, random: np.random.Generator) -> Scene:
-        state = State.at_rest(self.points, density=1000.0, dtype=self.dtype, device=self.device)
-        stroke = LETTERS[random.choice(sorted(LETTERS))]
-        stroke = stroke + stroke[-1:] * (CORNERS - len(stroke))
-        goal = torch.tensor(stroke, dtype=self.dtype, device=self.device)
-        first = float(clay_left(state.x[None], goal[None]))
-        x, y = random.uniform(0.3, 0.5, 2)
-        pose = (x, y, CLAY + 1.1 * (RADIUS + HALF), 1.0, 0.0, 0.0, 0.0)
-        return Scene(state, [pose], [*(number for corner in stroke for number in corner), first])
+    def particles(self) -> State:
+        return State.at_rest(self.points, density=1000.0, dtype=self.dtype, device=self.device)
+
+    def scenes(self, random: Tensor) -> Scenes:
+        letters = tuple(stroke + stroke[-1:] * (CORNERS - len(stroke)) for stroke in LETTERS.values())
+        stroke = self.constant(letters)[(random[:, 0] * len(letters)).long()]
+        left = clay_left(self.first.x[None], stroke)
+        x, y = (0.3 + 0.2 * random[:, 1:]).unbind(1)
+        poses = self.columns(x, y, CLAY + 1.1 * (RADIUS + HALF), 1.0, 0.0, 0.0, 0.0)[:, None]
+        return Scenes(poses, torch.cat([stroke.flatten(1), left[:, None]], 1))
 
     def velocities(self, actions: Tensor) -> Tensor:
         velocity = self.within(self.SPEED * actions[:, None], LOWEST, HIGHEST)

@@ -189,6 +189,14 @@ def not_negative(name: str, value: Any, expected: str = ">= 0") -> Any:
     return value
 
 
+def positive(name: str, value: Any) -> Any:
+    """Numbers that are finite and positive."""
+    value = finite(name, value, "positive and finite")
+    if value is None or any(number <= 0 for number in numbers_of(value)):
+        raise ValueError(f"{name} must be positive and finite, got {value}")
+    return value
+
+
 def friction(name: str, value: Any) -> Any:
     """A Coulomb coefficient."""
     return not_negative(name, finite(name, value, "a finite number >= 0"), "a finite number >= 0")

@@ -54,13 +54,13 @@ def body_tables(bodies: Sequence[Body], owner: Sequence[int], parts: Tensor, lik
     obstacles = [part.obstacle for body in bodies for part in body.parts]
     forms = [obstacle.shape for obstacle in obstacles]
     rows = [
-        (body.mass, *_axes(body.inertia, 1 if dim == 2 else 3), *_joint_numbers(body, "anchor", dim))
-        + _joint_numbers(body, "axis", dim)
+        torch.cat([body.mass_like(like)[None], body.moments_like(like, dim), _of_joint(body, "anchor", like)])
         for body in bodies
     ]
+    axes = [_of_joint(body, "axis", like) for body in bodies]
     return BodyTables(
         *tables_without_motion(obstacles, like, scenes),
-        filled(rows, like, torch.float64),
+        torch.cat([torch.stack(rows), torch.stack(axes)], 1),
         parts.to(like.device, non_blocking=True),
         (
             [form.number for form in forms],
@@ -72,13 +72,9 @@ def body_tables(bodies: Sequence[Body], owner: Sequence[int], parts: Tensor, lik
     )
 
 
-def _axes(inertia: tuple[float, ...], count: int) -> tuple[float, ...]:
-    return inertia if len(inertia) == count else inertia * count
-
-
-def _joint_numbers(body: Body, name: str, dim: int) -> tuple[float, ...]:
-    """D numbers of a joint; zeros where it has none."""
-    return getattr(body.joint, name, None) or (0.0,) * dim
+def _of_joint(body: Body, name: str, like: Tensor) -> Tensor:
+    """Numbers of a joint [D]; zeros where it has none."""
+    return filled(getattr(body.joint, name, None) or (0.0,) * like.shape[1], like, torch.float64)
 
 
 @torch.library.register_fake("torch_mpm::free_bodies")
