@@ -1,12 +1,13 @@
 #include "cpu/parallel.h"
-#include "cpu/transpose.h"
 #include "heat/cell.h"
 #include "heat/patches.h"
 #include "heat/solve.h"
 #include "heat/workspace.cpu.h"
+#include "transfer/scatter.cpu.h"
 
-// H applied in one pass: the particles of a cell read its nodes into registers as packs, and add to them there. Base
-// blocks add their tiles colour by colour, so that every sum has the same order for any number of threads.
+// H applied in one pass: the cells of a plane of a base block are in the lanes of packs, which add up the particles of
+// each cell without sums over lanes. Base blocks add their tiles colour by colour, so that every sum has the same order
+// for any number of threads.
 namespace mpm::cpu {
 inline namespace TORCH_MPM_ISA {
 
@@ -15,7 +16,6 @@ template <int Order, class T, int D>
 struct ScalarTile {
   static constexpr int kWidth = kBlockWidth + Order, kRow = 2 * kBlockWidth;
   static constexpr int kRows = D == 3 ? kWidth * kWidth : kWidth;
-  static constexpr int S = Order + 1, kNodes = kSupportNodes<Order, D>;
   alignas(64) T value[kRows * kRow];
 
   void clear() { __builtin_memset(value, 0, sizeof(value)); }
@@ -43,63 +43,140 @@ struct ScalarTile {
       for (int k = 0; k < n; k++) nodes[row + k] += tile[k];
     });
   }
+};
 
-  // The support of a cell, in the order of csrc/heat/cell.h.
+constexpr int kPlane = kBlockWidth * kBlockWidth;  // cells of a plane of a block, or of a block in 2-D
+template <class T>
+using PlaneOfCells = Pack<T, kPlane>;
+
+// from[index[l]] in lane l.
+template <class T>
+MPM_HD PlaneOfCells<T> take(const T* from, const int* index) {
+#ifdef __AVX512F__
+  if constexpr (sizeof(T) == 4) {
+    const __m512i at = _mm512_loadu_si512(index);
+    const __m512 r = _mm512_mask_i32gather_ps(_mm512_setzero_ps(), __mmask16(-1), at, from, 4);
+    return PlaneOfCells<T>::load(reinterpret_cast<const T*>(&r));
+  }
+#endif
+  return PlaneOfCells<T>::gather(from, index);
+}
+
+// The nodes in the support of a base block, so that those at one place in the supports of a plane of cells are a pack.
+template <int Order, class T, int D>
+struct CellTile {
+  using From = ScalarTile<Order, T, D>;
+  using P = PlaneOfCells<T>;
+  static constexpr int S = Order + 1, kPlanes = D == 3 ? kBlockWidth : 1, kNodePlanes = D == 3 ? From::kWidth : 1;
+  alignas(64) T value[kNodePlanes][S][From::kWidth][kBlockWidth];  // by x, place along the last axis, and cells
+  alignas(64) T sum[kNodePlanes][S][S][kPlane];                    // by x, places along the last axes, and cells
+
+  // visit(row of the tile, x, y) for all rows.
   template <class F>
-  MPM_HD void for_support(int cell, const F& visit) {
-    int first = 0;
-    MPM_UNROLL for (int a = 0; a < D; a++)
-      first = a == D - 1 ? first * kRow + cell_coordinate<D>(cell, a) : first * kWidth + cell_coordinate<D>(cell, a);
+  MPM_HD static void for_rows(const F& visit) {
+    for (int x = 0; x < kNodePlanes; x++)
+      for (int y = 0; y < From::kWidth; y++) visit((x * From::kWidth + y) * From::kRow, x, y);
+  }
+  void set(const From& tile) {
+    for_rows([&](int row, int x, int y) {
+      MPM_UNROLL for (int k = 0; k < S; k++)
+        Pack<T, kBlockWidth>::load(tile.value + row + k).store(value[x][k][y]);
+    });
+  }
+  void clear_sums() { __builtin_memset(sum, 0, sizeof(sum)); }
+  // Adds the sums to a tile of nodes.
+  void add_to(From& tile) const {
+    using Run = Pack<T, kBlockWidth>;
+    for (int k = 0; k < S; k++)  // outside, since the runs of consecutive k overlap
+      for (int x = 0; x < kNodePlanes; x++)
+        for (int j = 0; j < S; j++)
+          for (int y = 0; y < kBlockWidth; y++) {
+            T* const to = tile.value + (x * From::kWidth + y + j) * From::kRow + k;
+            (Run::load(to) + Run::load(sum[x][j][k] + y * kBlockWidth)).store(to);
+          }
+  }
+  // visit(n, node values, sums) for the places n of the supports of a plane of cells, in the order of csrc/heat/cell.h.
+  template <class F>
+  MPM_HD void for_support(int plane, const F& visit) {
     MPM_UNROLL for (int i = 0; i < (D == 3 ? S : 1); i++) MPM_UNROLL
       for (int j = 0; j < S; j++) MPM_UNROLL
-        for (int k = 0; k < S; k++) visit((i * S + j) * S + k, value[first + (i * kWidth + j) * kRow + k]);
+        for (int k = 0; k < S; k++) visit((i * S + j) * S + k, value[plane + i][k][j], sum[plane + i][j][k]);
   }
 };
 
-// Sums over the lanes of packs, added to the support of a cell.
-template <HeatSum Sum, int Order, class T, int D>
-void add_support(Lanes<T>* packs, int cell, ScalarTile<Order, T, D>& tile) {
-  constexpr int kNodes = kSupportNodes<Order, D>, kPadded = (kNodes + kLanes - 1) / kLanes * kLanes;
-  alignas(64) T rows[kLanes][kPadded];
-  store_transposed<kPadded>(packs, rows[0], kPadded);
-  MPM_UNROLL for (int n = 0; n < kPadded; n++) {
-    T sum = rows[0][n];
-    for (int l = 1; l < kLanes; l++) sum += rows[l][n];
-    rows[0][n] = sum;
-  }
-  if (Sum == HeatSum::product) to_nodes<Order, D>(rows[0]);
-  tile.for_support(cell, [&](int n, T& value) { value += rows[0][n]; });
-}
+// The particles of a chunk: distances from the base nodes [cells], and scaled conductance; and their numbers in the
+// order of cells.
+template <int Order, class T, int D>
+struct Conductors {
+  static constexpr int kLine = kChunk + 16;
+  alignas(64) T f[D][kLine], conductance[kLine];
+  int number[kLine];
 
-// The particles order[begin, end) of a chunk, which lie in one cell; returns Σ κ V |∇u|².
+  void set(const Topology<T, D>& t, const Field<const T>& x, const Field<const T>& of, const BaseBlock<T, D>& base_block,
+           const Chunk& chunk) {
+    constexpr int N = kWideLanes<T>;
+    const bool direct = unit_stride(x, of);
+    for (int i = 0; i < chunk.count; i++) number[i] = chunk.by_cell(i);
+    for (int i = 0; i < chunk.count; i += N) {
+      const GroupOf<N> g = group_by_id<N>(chunk, i);
+      direct&& g.consecutive ? put(t, x, of, base_block, chunk, i, RunOf<N>{g.id[0]})
+                             : put(t, x, of, base_block, chunk, i, g);
+    }
+  }
+
+ private:
+  template <class G>
+  MPM_HD void put(const Topology<T, D>& t, const Field<const T>& x, const Field<const T>& of,
+                  const BaseBlock<T, D>& base_block, const Chunk& chunk, int i, const G& g) {
+    constexpr int N = G::kSize;
+    Pack<T, N> position[D], distance[D];
+    MPM_UNROLL for (int a = 0; a < D; a++)
+      position[a] = load(x, g, a);
+    distances(t, base_block, entries_of<N>(chunk.order + i, chunk.count - i), position, distance);
+    MPM_UNROLL for (int a = 0; a < D; a++)
+      distance[a].store(f[a] + i);
+    scaled_conductance<Order>(load(of, g), t.geometry.inverse_dx).store(conductance + i);
+  }
+};
+
+// Adds the particles of a chunk in a plane of cells to its sums; returns Σ κ V |∇u|².
 template <HeatSum Sum, int Order, class T, int D>
-T sum_cell(const Topology<T, D>& t, const Field<const T>& x, const Field<const T>& conductance,
-           const BaseBlock<T, D>& base_block, const Chunk& chunk, int cell, int begin, int end,
-           ScalarTile<Order, T, D>& u, ScalarTile<Order, T, D>& sum, const int* e) {
-  using P = Lanes<T>;
-  constexpr int kNodes = kSupportNodes<Order, D>, kPadded = (kNodes + kLanes - 1) / kLanes * kLanes;
-  static constexpr T kLane[kLanes] = {0, 1, 2, 3, 4, 5, 6, 7};
-  T from[kNodes];
+T sum_plane(const Chunk& chunk, const Conductors<Order, T, D>& particles, int plane, CellTile<Order, T, D>& tile,
+            const int* e) {
+  using P = PlaneOfCells<T>;
+  constexpr int kNodes = kSupportNodes<Order, D>;
+  int first[kPlane], count[kPlane], rounds = 0;
+  T counts[kPlane];
+  for (int l = 0; l < kPlane; l++) {
+    const int cell = plane * kPlane + l;
+    first[l] = cell ? chunk.cell_end[cell - 1] : 0;
+    count[l] = chunk.cell_end[cell] - first[l];
+    counts[l] = T(count[l]);
+    rounds = count[l] > rounds ? count[l] : rounds;
+  }
+  if (rounds == 0) return T(0);
+  const P of_cell = P::load(counts);
+  P from[kNodes], to[kNodes], power(0);
   if (Sum == HeatSum::product) {
-    u.for_support(cell, [&](int n, T& value) { from[n] = value; });
+    tile.for_support(plane, [&](int n, const T* value, T*) { from[n] = P::load(value); });
     to_differences<Order, D>(from);
   }
-  P to[kPadded], power(0);
-  for (int n = 0; n < kPadded; n++) to[n] = P(0);
-  for (int i = begin; i < end; i += kLanes) {
-    const Group g = group_by_cell(chunk, i, end);
+  for (int n = 0; n < kNodes; n++) to[n] = P(0);
+  for (int r = 0; r < rounds; r++) {
+    int index[kPlane];
+    for (int l = 0; l < kPlane; l++) index[l] = particles.number[r < count[l] ? first[l] + r : 0];
     P f[D];
-    MPM_UNROLL for (int a = 0; a < D; a++) {
-      const T base = T(base_block.corner[a] + cell_coordinate<D>(cell, a));
-      f[a] = distance_in_cells(t.geometry, a, load(x, g, a), P(base));
-    }
-    const auto real = P::load(kLane) < P(g.count);
-    const P scaled = scaled_conductance<Order>(load(conductance, g), t.geometry.inverse_dx);
-    power += add_particle<Sum, Order, P, D>(f, select(real, scaled, P(0)), from, to, e);
+    MPM_UNROLL for (int a = 0; a < D; a++)
+      f[a] = take(particles.f[a], index);
+    const P conductance = select(P(r) < of_cell, take(particles.conductance, index), P(0));
+    power += add_particle<Sum, Order, P, D>(f, conductance, from, to, e);
   }
-  add_support<Sum, Order, T, D>(to, cell, sum);
+  if (Sum == HeatSum::product) to_nodes<Order, D>(to);
+  const auto filled = P(0) < of_cell;  // NaN at nodes stays out of cells without particles
+  tile.for_support(plane, [&](int n, const T*, T* sum) { (P::load(sum) + select(filled, to[n], P(0))).store(sum); });
+  power = select(filled, power, P(0));
   T total = power[0];
-  for (int l = 1; l < kLanes; l++) total += power[l];
+  for (int l = 1; l < kPlane; l++) total += power[l];
   return total;
 }
 
@@ -111,7 +188,9 @@ void sum_particles(const Topology<T, D>& t, const Field<const T>& x, const Field
   const ScheduleIn s = schedule_of(t);
   PhaseCounter<kColours<D>> colours{s.colour_start};
   parallel_base_blocks<D>(s, t.particles, [&](const auto& next) {
-    ScalarTile<Order, T, D> u, sum;
+    ScalarTile<Order, T, D> nodes_of_block;
+    CellTile<Order, T, D> tile;
+    Conductors<Order, T, D> particles;
     int colour = 0;
     for (int64_t b; (b = next()) >= 0;) {
       const int slot = s.base_slot[b];
@@ -121,18 +200,23 @@ void sum_particles(const Topology<T, D>& t, const Field<const T>& x, const Field
         colours.finish(colour);
         continue;
       }
-      if (Sum == HeatSum::product) u.load_from(nodes, base_block);
-      sum.clear();
+      if (Sum == HeatSum::product) {
+        nodes_of_block.load_from(nodes, base_block);
+        tile.set(nodes_of_block);
+      }
+      tile.clear_sums();
       double power = 0;
       for (int64_t c = s.base_chunk[b]; c < s.base_chunk[b + 1]; c++) {
         const Chunk chunk(t, s, c);
-        for (int cell = 0, begin = 0; cell < kBlockNodes<D>; begin = chunk.cell_end[cell++])
-          if (const int end = chunk.cell_end[cell]; begin < end)
-            power += double(sum_cell<Sum, Order>(t, x, conductance, base_block, chunk, cell, begin, end, u, sum, e));
+        particles.set(t, x, conductance, base_block, chunk);
+        for (int plane = 0; plane < tile.kPlanes; plane++)
+          power += double(sum_plane<Sum, Order>(chunk, particles, plane, tile, e));
       }
       finish(slot, power);
+      nodes_of_block.clear();
+      tile.add_to(nodes_of_block);
       colours.wait_before(colour);
-      sum.add_to(out, base_block);
+      nodes_of_block.add_to(out, base_block);
       colours.finish(colour);
     }
   });
