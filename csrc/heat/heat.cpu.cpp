@@ -3,6 +3,7 @@
 #include "heat/patches.h"
 #include "heat/solve.h"
 #include "heat/workspace.cpu.h"
+#include "transfer/own_nodes.cpu.h"
 #include "transfer/scatter.cpu.h"
 
 // H applied in one pass: the cells of a plane of a base block are in the lanes of packs, which add up the particles of
@@ -180,6 +181,31 @@ T sum_plane(const Chunk& chunk, const Conductors<Order, T, D>& particles, int pl
   return total;
 }
 
+// Adds a particle that has left its base block while its activation lasts; returns κ V |∇u|².
+template <HeatSum Sum, int Order, class T, int D>
+T sum_out_of_block(const Topology<T, D>& t, int scene, const Field<const T>& x, const Field<const T>& conductance,
+                   int64_t p, const T* nodes, T* out, const int* e) {
+  constexpr int kNodes = kSupportNodes<Order, D>, S = Order + 1;
+  int base[D];
+  T f[D];
+  for (int a = 0; a < D; a++) {
+    const T position = at(x, p, a), node = base_node<Order>(t.geometry, a, position);
+    base[a] = int(node);
+    f[a] = distance_in_cells(t.geometry, a, position, node);
+  }
+  const NodesOf<Order, T, D> own(t, scene, base);
+  T from[kNodes], to[kNodes] = {};
+  if (Sum == HeatSum::product) {
+    for (int n = 0; n < kNodes; n++) from[n] = nodes[own.row[n / S][n % S]];
+    to_differences<Order, D>(from);
+  }
+  const T scaled = scaled_conductance<Order>(at(conductance, p), t.geometry.inverse_dx);
+  const T power = add_particle<Sum, Order, T, D>(f, scaled, from, to, e);
+  if (Sum == HeatSum::product) to_nodes<Order, D>(to);
+  for (int n = 0; n < kNodes; n++) out[own.row[n / S][n % S]] += to[n];
+  return power;
+}
+
 // Adds a sum over the particles of every base block of an active scene to the nodes; finish(slot, Σ κ V |∇u|²) per base
 // block.
 template <HeatSum Sum, int Order, class T, int D, class Wanted, class Finish>
@@ -212,11 +238,17 @@ void sum_particles(const Topology<T, D>& t, const Field<const T>& x, const Field
         for (int plane = 0; plane < tile.kPlanes; plane++)
           power += double(sum_plane<Sum, Order>(chunk, particles, plane, tile, e));
       }
-      finish(slot, power);
       nodes_of_block.clear();
       tile.add_to(nodes_of_block);
       colours.wait_before(colour);
       nodes_of_block.add_to(out, base_block);
+      for (int64_t c = s.base_chunk[b]; c < s.base_chunk[b + 1]; c++) {
+        const Chunk chunk(t, s, c);
+        for (int i = chunk.cell_end[kBlockNodes<D> - 1]; i < chunk.count; i++)
+          power += double(sum_out_of_block<Sum, Order>(t, base_block.scene, x, conductance, chunk.id[chunk.by_cell(i)],
+                                                       nodes, out, e));
+      }
+      finish(slot, power);
       colours.finish(colour);
     }
   });
@@ -242,7 +274,7 @@ struct HeatSolver {
   // f(node) for the nodes of every slot of an active scene; the returned sums are stored by slot.
   template <class Wanted, class F>
   void for_slots(const Wanted& wanted, const F& f) const {
-    parallel_ranges(a.topology.max_blocks, kGrain, [&](int64_t begin, int64_t end) {
+    parallel_ranges(near_blocks(a), kGrain, [&](int64_t begin, int64_t end) {
       for (int64_t slot = begin; slot < end; slot++)
         if (const int scene = scene_of(slot); wanted(scene)) f(slot, scene, slot * kBlockNodes<D>);
     });
@@ -250,7 +282,7 @@ struct HeatSolver {
   bool running(int scene) const { return scene >= 0 && w.scene[scene].running; }
 
   void start() const {
-    const int64_t nodes = a.topology.max_blocks * int64_t(kBlockNodes<D>);
+    const int64_t nodes = near_blocks(a) * int64_t(kBlockNodes<D>);
     parallel_ranges(nodes, 65536, [&](int64_t begin, int64_t end) {
       T* const vectors[] = {w.v.product, w.v.inverse, w.v.weight};
       for (T* vector : vectors) __builtin_memset(vector + begin, 0, (end - begin) * sizeof(T));
@@ -301,13 +333,13 @@ struct HeatSolver {
   // f(scene, sum over its slots); the order of the sums does not depend on threads.
   template <class Wanted, class Kept, class Sum, class F>
   void for_scenes(const Wanted& wanted, const Kept* kept, const Sum& zero, const F& f) const {
-    int64_t slot = 0;
-    for (int scene = 0; scene < a.topology.scenes; scene++) {
-      Sum sum = zero;
-      for (; slot < a.topology.max_blocks && scene_of(slot) <= scene && scene_of(slot) >= 0; slot++)
-        if (wanted(scene)) sum.add(kept[slot]);
-      if (wanted(scene)) f(scene, sum);
-    }
+    static_assert(sizeof(Sum) <= sizeof(StartSums<double>));
+    Sum* const sums = static_cast<Sum*>(w.sums);
+    for (int scene = 0; scene < a.topology.scenes; scene++) sums[scene] = zero;
+    for (int64_t slot = 0; slot < near_blocks(a); slot++)
+      if (const int scene = scene_of(slot); scene >= 0 && wanted(scene)) sums[scene].add(kept[slot]);
+    for (int scene = 0; scene < a.topology.scenes; scene++)
+      if (wanted(scene)) f(scene, sums[scene]);
   }
 
   bool iterate() const {
