@@ -6,9 +6,9 @@
 #include "transfer/own_nodes.cpu.h"
 #include "transfer/scatter.cpu.h"
 
-// H applied in one pass: the cells of a plane of a base block are in the lanes of packs, which add up the particles of
-// each cell without sums over lanes. Base blocks add their tiles colour by colour, so that every sum has the same order
-// for any number of threads.
+// H applied in one pass: four rows of cells of a base block are in the lanes of packs, which add up the particles of each
+// cell without sums over lanes. Base blocks add their tiles colour by colour, so that every sum has the same order for
+// any number of threads.
 namespace mpm::cpu {
 inline namespace TORCH_MPM_ISA {
 
@@ -20,6 +20,12 @@ struct ScalarTile {
   alignas(64) T value[kRows * kRow];
 
   void clear() { __builtin_memset(value, 0, sizeof(value)); }
+
+  // Place of the first node of a cell, and those of the nodes that are further along the axes from there.
+  static int first_of(int cell) {
+    return offset(D == 3 ? cell_coordinate<D>(cell, 0) : 0, cell_coordinate<D>(cell, D - 2), cell_coordinate<D>(cell, D - 1));
+  }
+  static constexpr int offset(int i, int j, int k) { return (i * kWidth + j) * kRow + k; }
 
   // visit(tile values, node row of the pool, nodes) for every run of nodes in an active block
   template <class F>
@@ -46,64 +52,66 @@ struct ScalarTile {
   }
 };
 
-constexpr int kPlane = kBlockWidth * kBlockWidth;  // cells of a plane of a block, or of a block in 2-D
+constexpr int kRowsOfCells = 4, kCells = kRowsOfCells * kBlockWidth;
 template <class T>
-using PlaneOfCells = Pack<T, kPlane>;
+using Cells = Pack<T, kCells>;
+template <class T>
+using RowOfCells = Pack<T, kBlockWidth>;
 
 // from[index[l]] in lane l.
 template <class T>
-MPM_HD PlaneOfCells<T> take(const T* from, const int* index) {
+MPM_HD Cells<T> take(const T* from, const int* index) {
 #ifdef __AVX512F__
   if constexpr (sizeof(T) == 4) {
     const __m512i at = _mm512_loadu_si512(index);
     const __m512 r = _mm512_mask_i32gather_ps(_mm512_setzero_ps(), __mmask16(-1), at, from, 4);
-    return PlaneOfCells<T>::load(reinterpret_cast<const T*>(&r));
+    return Cells<T>::load(reinterpret_cast<const T*>(&r));
   }
 #endif
-  return PlaneOfCells<T>::gather(from, index);
+  return Cells<T>::gather(from, index);
 }
 
-// The nodes in the support of a base block, so that those at one place in the supports of a plane of cells are a pack.
-template <int Order, class T, int D>
-struct CellTile {
-  using From = ScalarTile<Order, T, D>;
-  using P = PlaneOfCells<T>;
-  static constexpr int S = Order + 1, kPlanes = D == 3 ? kBlockWidth : 1, kNodePlanes = D == 3 ? From::kWidth : 1;
-  alignas(64) T value[kNodePlanes][S][From::kWidth][kBlockWidth];  // by x, place along the last axis, and cells
-  alignas(64) T sum[kNodePlanes][S][S][kPlane];                    // by x, places along the last axes, and cells
+// The same for integers, from the places first[l] + n of lanes with n < count[l]; zero in the others.
+MPM_HD void take(const int* from, const int* first, const int* count, int n, int* to) {
+#ifdef __AVX512F__
+  const __m512i nth = _mm512_set1_epi32(n), at = _mm512_add_epi32(_mm512_loadu_si512(first), nth);
+  const __mmask16 lanes = _mm512_cmplt_epi32_mask(nth, _mm512_loadu_si512(count));
+  _mm512_storeu_si512(to, _mm512_mask_i32gather_epi32(_mm512_setzero_si512(), lanes, at, from, 4));
+#else
+  for (int l = 0; l < kCells; l++) to[l] = n < count[l] ? from[first[l] + n] : 0;
+#endif
+}
 
-  // visit(row of the tile, x, y) for all rows.
-  template <class F>
-  MPM_HD static void for_rows(const F& visit) {
-    for (int x = 0; x < kNodePlanes; x++)
-      for (int y = 0; y < From::kWidth; y++) visit((x * From::kWidth + y) * From::kRow, x, y);
+// Four rows one after another.
+template <class T>
+MPM_HD Cells<T> load_rows(const T* const row[kRowsOfCells], int offset) {
+  if constexpr (Cells<T>::kParts == 1) {
+    using V = typename RegisterOf<T, kBlockWidth>::Value;
+    V r[kRowsOfCells];
+    MPM_UNROLL for (int k = 0; k < kRowsOfCells; k++)
+      __builtin_memcpy(&r[k], row[k] + offset, sizeof(V));
+    const auto low = __builtin_shufflevector(r[0], r[1], 0, 1, 2, 3, 4, 5, 6, 7);
+    const auto high = __builtin_shufflevector(r[2], r[3], 0, 1, 2, 3, 4, 5, 6, 7);
+    Cells<T> all;
+    all.part[0] = __builtin_shufflevector(low, high, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+    return all;
+  } else {
+    T lanes[kCells];
+    MPM_UNROLL for (int k = 0; k < kRowsOfCells; k++)
+      RowOfCells<T>::load(row[k] + offset).store(lanes + k * kBlockWidth);
+    return Cells<T>::load(lanes);
   }
-  void set(const From& tile) {
-    for_rows([&](int row, int x, int y) {
-      MPM_UNROLL for (int k = 0; k < S; k++)
-        Pack<T, kBlockWidth>::load(tile.value + row + k).store(value[x][k][y]);
-    });
+}
+
+template <class T>
+MPM_HD void add_to_rows(const Cells<T>& sums, T* const row[kRowsOfCells], int offset) {
+  T lanes[kCells];
+  sums.store(lanes);
+  MPM_UNROLL for (int k = 0; k < kRowsOfCells; k++) {
+    T* const to = row[k] + offset;
+    (RowOfCells<T>::load(to) + RowOfCells<T>::load(lanes + k * kBlockWidth)).store(to);
   }
-  void clear_sums() { __builtin_memset(sum, 0, sizeof(sum)); }
-  // Adds the sums to a tile of nodes.
-  void add_to(From& tile) const {
-    using Run = Pack<T, kBlockWidth>;
-    for (int k = 0; k < S; k++)  // outside, since the runs of consecutive k overlap
-      for (int x = 0; x < kNodePlanes; x++)
-        for (int j = 0; j < S; j++)
-          for (int y = 0; y < kBlockWidth; y++) {
-            T* const to = tile.value + (x * From::kWidth + y + j) * From::kRow + k;
-            (Run::load(to) + Run::load(sum[x][j][k] + y * kBlockWidth)).store(to);
-          }
-  }
-  // visit(n, node values, sums) for the places n of the supports of a plane of cells, in the order of csrc/heat/cell.h.
-  template <class F>
-  MPM_HD void for_support(int plane, const F& visit) {
-    MPM_UNROLL for (int i = 0; i < (D == 3 ? S : 1); i++) MPM_UNROLL
-      for (int j = 0; j < S; j++) MPM_UNROLL
-        for (int k = 0; k < S; k++) visit((i * S + j) * S + k, value[plane + i][k][j], sum[plane + i][j][k]);
-  }
-};
+}
 
 // The particles of a chunk: distances from the base nodes [cells], and scaled conductance; and their numbers in the
 // order of cells.
@@ -140,45 +148,76 @@ struct Conductors {
   }
 };
 
-// Adds the particles of a chunk in a plane of cells to its sums; returns Σ κ V |∇u|².
+// Adds the particles of a chunk in rows of cells to the tile `sum`; returns Σ κ V |∇u|².
 template <HeatSum Sum, int Order, class T, int D>
-T sum_plane(const Chunk& chunk, const Conductors<Order, T, D>& particles, int plane, CellTile<Order, T, D>& tile,
-            const int* e) {
-  using P = PlaneOfCells<T>;
-  constexpr int kNodes = kSupportNodes<Order, D>;
-  int first[kPlane], count[kPlane], rounds = 0;
-  T counts[kPlane];
-  for (int l = 0; l < kPlane; l++) {
-    const int cell = plane * kPlane + l;
-    first[l] = cell ? chunk.cell_end[cell - 1] : 0;
-    count[l] = chunk.cell_end[cell] - first[l];
-    counts[l] = T(count[l]);
-    rounds = count[l] > rounds ? count[l] : rounds;
+T sum_rows(const Chunk& chunk, const Conductors<Order, T, D>& particles, const int* rows, int row_count,
+           ScalarTile<Order, T, D>& u, ScalarTile<Order, T, D>& sum, const int* e) {
+  using P = Cells<T>;
+  using Tile = ScalarTile<Order, T, D>;
+  constexpr int kNodes = kSupportNodes<Order, D>, S = Order + 1;
+  alignas(64) int first[kCells], count[kCells], index[kCells];
+  T counts[kCells];
+  const T* from_row[kRowsOfCells];
+  T* to_row[kRowsOfCells];
+  int most = 0;
+  for (int k = 0; k < kRowsOfCells; k++) {
+    const int row = rows[k < row_count ? k : 0], cell = row * kBlockWidth;
+    const int place = Tile::first_of(cell);
+    from_row[k] = u.value + place;
+    to_row[k] = sum.value + place;
+    for (int i = 0; i < kBlockWidth; i++) {
+      const int l = k * kBlockWidth + i, begin = cell + i ? chunk.cell_end[cell + i - 1] : 0;
+      first[l] = begin;
+      count[l] = k < row_count ? chunk.cell_end[cell + i] - begin : 0;
+      counts[l] = T(count[l]);
+      most = count[l] > most ? count[l] : most;
+    }
   }
-  if (rounds == 0) return T(0);
   const P of_cell = P::load(counts);
   P from[kNodes], to[kNodes], power(0);
   if (Sum == HeatSum::product) {
-    tile.for_support(plane, [&](int n, const T* value, T*) { from[n] = P::load(value); });
+    MPM_UNROLL for (int n = 0; n < kNodes; n++)
+      from[n] = load_rows(from_row, Tile::offset(n / (S * S), n / S % S, n % S));
     to_differences<Order, D>(from);
   }
   for (int n = 0; n < kNodes; n++) to[n] = P(0);
-  for (int r = 0; r < rounds; r++) {
-    int index[kPlane];
-    for (int l = 0; l < kPlane; l++) index[l] = particles.number[r < count[l] ? first[l] + r : 0];
+  for (int n = 0; n < most; n++) {
+    take(particles.number, first, count, n, index);
     P f[D];
     MPM_UNROLL for (int a = 0; a < D; a++)
       f[a] = take(particles.f[a], index);
-    const P conductance = select(P(r) < of_cell, take(particles.conductance, index), P(0));
+    const P conductance = select(P(n) < of_cell, take(particles.conductance, index), P(0));
     power += add_particle<Sum, Order, P, D>(f, conductance, from, to, e);
   }
   if (Sum == HeatSum::product) to_nodes<Order, D>(to);
   const auto filled = P(0) < of_cell;  // NaN at nodes stays out of cells without particles
-  tile.for_support(plane, [&](int n, const T*, T* sum) { (P::load(sum) + select(filled, to[n], P(0))).store(sum); });
+  for (int k = 0; k < S; k++)          // outside, since the rows of consecutive k overlap
+    MPM_UNROLL for (int n = 0; n < kNodes / S; n++)
+      add_to_rows(select(filled, to[n * S + k], P(0)), to_row, Tile::offset(n / S, n % S, k));
   power = select(filled, power, P(0));
   T total = power[0];
-  for (int l = 1; l < kPlane; l++) total += power[l];
+  for (int l = 1; l < kCells; l++) total += power[l];
   return total;
+}
+
+// Prefetches the cache lines of some components of particles from .. to - 1 of a chunk.
+template <class T>
+MPM_HD void prefetch_rows(const Field<const T>& x, int components, const Chunk& chunk, int from, int to) {
+  constexpr int line = 64 / int(sizeof(T));
+  for (int i = from; i < to && i < chunk.count; i += line)
+    for (int a = 0; a < components; a++) __builtin_prefetch(row_of(x, a) + chunk.id[i] * x.stride[0], 0, 2);
+}
+
+// The rows of cells with particles of a chunk; returns their number.
+template <int D>
+int rows_with_particles(const Chunk& chunk, int rows[kBlockNodes<D> / kBlockWidth]) {
+  int count = 0;
+  for (int row = 0, before = 0; row < kBlockNodes<D> / kBlockWidth; row++) {
+    const int end = chunk.cell_end[(row + 1) * kBlockWidth - 1];
+    if (end > before) rows[count++] = row;
+    before = end;
+  }
+  return count;
 }
 
 // Adds a particle that has left its base block while its activation lasts; returns κ V |∇u|².
@@ -212,10 +251,10 @@ template <HeatSum Sum, int Order, class T, int D, class Wanted, class Finish>
 void sum_particles(const Topology<T, D>& t, const Field<const T>& x, const Field<const T>& conductance, const T* nodes,
                    T* out, const Wanted& wanted, const Finish& finish, const int* e = nullptr) {
   const ScheduleIn s = schedule_of(t);
+  const int64_t chunks = s.base_chunk[s.colour_start[kColours<D>]];
   PhaseCounter<kColours<D>> colours{s.colour_start};
   parallel_base_blocks<D>(s, t.particles, [&](const auto& next) {
-    ScalarTile<Order, T, D> nodes_of_block;
-    CellTile<Order, T, D> tile;
+    ScalarTile<Order, T, D> u, sum;
     Conductors<Order, T, D> particles;
     int colour = 0;
     for (int64_t b; (b = next()) >= 0;) {
@@ -226,22 +265,23 @@ void sum_particles(const Topology<T, D>& t, const Field<const T>& x, const Field
         colours.finish(colour);
         continue;
       }
-      if (Sum == HeatSum::product) {
-        nodes_of_block.load_from(nodes, base_block);
-        tile.set(nodes_of_block);
-      }
-      tile.clear_sums();
+      if (Sum == HeatSum::product) u.load_from(nodes, base_block);
+      sum.clear();
       double power = 0;
       for (int64_t c = s.base_chunk[b]; c < s.base_chunk[b + 1]; c++) {
-        const Chunk chunk(t, s, c);
+        const Chunk chunk(t, s, c), after(t, s, c + 1 < chunks ? c + 1 : c);
         particles.set(t, x, conductance, base_block, chunk);
-        for (int plane = 0; plane < tile.kPlanes; plane++)
-          power += double(sum_plane<Sum, Order>(chunk, particles, plane, tile, e));
+        int rows[kBlockNodes<D> / kBlockWidth];
+        const int count = rows_with_particles<D>(chunk, rows);
+        for (int k = 0; k < count; k += kRowsOfCells) {
+          const int begin = after.count * k / count, end = after.count * (k + kRowsOfCells) / count;
+          prefetch_rows(x, D, after, begin, end);
+          prefetch_rows(conductance, 1, after, begin, end);
+          power += double(sum_rows<Sum, Order>(chunk, particles, rows + k, count - k, u, sum, e));
+        }
       }
-      nodes_of_block.clear();
-      tile.add_to(nodes_of_block);
       colours.wait_before(colour);
-      nodes_of_block.add_to(out, base_block);
+      sum.add_to(out, base_block);
       for (int64_t c = s.base_chunk[b]; c < s.base_chunk[b + 1]; c++) {
         const Chunk chunk(t, s, c);
         for (int i = chunk.cell_end[kBlockNodes<D> - 1]; i < chunk.count; i++)
