@@ -30,8 +30,7 @@ MPM_BACKEND_KERNELS(MPM_HEAT_KERNELS)
   ORDERED(heat_to_particles, HeatToParticlesArguments)
 MPM_BACKEND_KERNELS(MPM_HEAT_TRANSFER_KERNELS)
 
-// Of one backend alone.
-#define MPM_HEAT_CPU_KERNELS(PLAIN, ORDERED, SIZE) PLAIN(heat_largest, HeatLargestArguments)
+// On CUDA alone.
 #define MPM_HEAT_CUDA_KERNELS(PLAIN, ORDERED, SIZE) \
   ORDERED(heat_advance, HeatAdvanceArguments)       \
   ORDERED(heat_exchange, ScatterArguments)          \
@@ -39,8 +38,6 @@ MPM_BACKEND_KERNELS(MPM_HEAT_TRANSFER_KERNELS)
   PLAIN(heat_finish, HeatFinishArguments)
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda
 MPM_BACKEND_KERNELS(MPM_HEAT_CUDA_KERNELS)
-#else
-MPM_BACKEND_KERNELS(MPM_HEAT_CPU_KERNELS)
 #endif
 
 #define MPM_HEAT_BACKWARD_KERNELS(PLAIN, ORDERED, SIZE)                             \

@@ -26,8 +26,8 @@ enum HeatChannel : int { kHeatCapacity, kHeatVarying, kHeatTheta, kHeatMean, kHe
 template <class T, int D>
 struct HeatArguments {
   Topology<T, D> topology;
-  int near_blocks = 0;                 // on CUDA: slots in the order of scenes, zero for all; those after them have no
-                                       // particles
+  int near_blocks = 0;                 // slots that a solve considers, zero for all: on CUDA those in the order of
+                                       // scenes, before those without particles; on the CPU those with a block
   Field<const T> x, conductance;       // conductance κ V [P]
   const T* heat_capacity = nullptr;    // [N], as those below
   const T* theta = nullptr;            // absent: zero

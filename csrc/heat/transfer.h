@@ -48,8 +48,8 @@ struct HeatToNodesArguments {
   Field<const T> scene_dt;
   double dt = 0;
   bool deterministic = false;
-  Field<T> conductance, blend, number;  // results per particle; the number may be absent on CUDA
-  double* largest = nullptr;            // on CUDA: [scenes], raised to the largest number of a particle
+  Field<T> conductance, blend, number;  // results per particle; the number may be absent
+  double* largest = nullptr;            // [scenes], raised to the largest number of a particle
   NodeField<T> sums;                    // kHeatChannels, zero on entry
 };
 
@@ -106,8 +106,8 @@ struct HeatToParticlesArguments {
   double dt = 0, moment_scale = 1;
   NodeField<const T> nodes;          // the sums from kHeatTheta on: increment and θ̄
   Field<T> theta, gradient, liquid;  // results, in other memory than the inputs
-  Field<T> changing;  // on the CPU: diffusion number where the liquid fraction changes, else zero; may be absent
-  double* largest = nullptr;  // on CUDA: column [scenes] of the status, raised to the largest of these numbers
+  double* largest = nullptr;  // column [scenes] of the status, raised to the largest diffusion number of a particle
+                              // whose liquid fraction changes
 };
 
 // Nodes with matter in an obstacle are held at a temperature.
@@ -197,16 +197,6 @@ struct HeatCountArguments {
   const T* residual = nullptr;
   const T* scene_dt = nullptr;  // may be absent
   double* status = nullptr;     // [scenes, kHeatStatusSize]
-};
-
-// The largest of a value of the particles in each scene, NaN where one is NaN; on the CPU.
-template <class T, int D>
-struct HeatLargestArguments {
-  int64_t particles = 0, scenes = 0;
-  Field<const T> value;
-  Field<const int> scene;     // absent: one scene
-  double* largest = nullptr;  // [scenes], raised to it
-  int64_t stride = 1;
 };
 
 }  // namespace mpm

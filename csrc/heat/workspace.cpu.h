@@ -18,6 +18,7 @@ struct HeatWorkspace {
   StepSums<T>* step;     // [max_blocks]
   Curvature* curvature;  // [max_blocks]
   HeatScene* scene;      // [scenes]
+  void* sums;            // [scenes], of any kind
   int64_t size;          // in bytes
 };
 
@@ -39,6 +40,7 @@ HeatWorkspace<T> lay_out_heat(const HeatArguments<T, D>& a, char* start) {
   w.step = reinterpret_cast<StepSums<T>*>(take(slots * int64_t(sizeof(StepSums<T>))));
   w.curvature = reinterpret_cast<Curvature*>(take(slots * int64_t(sizeof(Curvature))));
   w.scene = reinterpret_cast<HeatScene*>(take(a.topology.scenes * int64_t(sizeof(HeatScene))));
+  w.sums = take(a.topology.scenes * int64_t(sizeof(StartSums<double>)));
   w.size = used;
   return w;
 }

@@ -1,6 +1,7 @@
 #pragma once
 
 #include "grid/grid_update.h"
+#include "heat/transfer.h"
 #include "rollout/laws_p2g.h"
 #include "transfer/advance.h"
 
@@ -17,6 +18,18 @@ struct G2P2GChunksArguments {
   NodeRow<T, D>* sums = nullptr;              // node sums of the next one
   bool follows = false;                       // whether laws and P2G follow
   bool fresh = false;                         // whether this is the first pass since the activation
+  // With heat, whose node temperatures lie between: G2P of the velocities is in HeatG2PChunksArguments, and v and C are
+  // its results. G2P of heat, in place; absent without heat.
+  const HeatToParticlesArguments<T, D>* heat = nullptr;
+  Field<T> volume_next{};  // present volumes at the end of the step
+};
+
+// G2P of the velocities, and P2G of heat, at the same positions.
+template <class T, int D>
+struct HeatG2PChunksArguments {
+  G2PAdvanceArguments<T, D> advance;  // writes v and C alone
+  const NodeRow<T, D>* velocities = nullptr;
+  HeatToNodesArguments<T, D> to_nodes;
 };
 
 // Longest displacement of a node along an axis in the time step of its scene, as a multiple of dt; infinite if a

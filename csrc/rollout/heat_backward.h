@@ -130,7 +130,7 @@ template <class T, int D>
 HeatToParticlesBackwardArguments<T, D> HeatBackward<T, D>::to_particles(const HeatSolution<T, D>& solution,
                                                                         const HeatAdjoints& adjoints) {
   HeatToParticlesBackwardArguments<T, D> a;
-  a.forward = heat().to_particles(solution.down);
+  a.forward = heat().to_particles(solution.down, true);
   a.theta = HeatSteps<T, D>::column_of(adjoints.state, 0);
   a.gradient = HeatSteps<T, D>::column_of(adjoints.state, heat().gradient_column());
   a.liquid = HeatSteps<T, D>::column_of(adjoints.state, heat().liquid_column());

@@ -76,9 +76,8 @@ class HeatSteps {
   void join_g2p(const Field<const T>& x, const Field<const T>& mass, const Field<const T>& velocity_gradient,
                 backend::Stream stream) {
     if (!s_.displacements.defined() || in_.lattice.deterministic()) return;
-    make_nodes(stream);
     HeatAdvanceArguments<T, D>& a = s_.with_heat;
-    a.to_nodes = to_nodes(x, mass, velocity_gradient);
+    a.to_nodes = begin_nodes(x, mass, velocity_gradient, stream);
     a.rest = s_.p2g.volume;
     a.volume_next = column(fields.next(true), volume_);
     a.workspace = packs_in_g2p() ? workspace(stream) : nullptr;
@@ -89,10 +88,9 @@ class HeatSteps {
   void run(const Field<const T>& x, const Field<const T>& mass, const Field<const T>& rest,
            const Field<const T>& velocity_gradient, const Field<const int>& scene, backend::Stream stream) {
     const HeatSolution<T, D> solution = conduct(x, mass, rest, velocity_gradient, scene, stream);
-    HeatToParticlesArguments<T, D> up = to_particles(solution.down);
+    HeatToParticlesArguments<T, D> up = to_particles(solution.down, true);
     backend::heat_to_particles(in_.lattice.order(), up, stream);
     fields.go(true);
-    if (melts()) find_largest(changing_, scene, rows_of_status() + kLargestFront, kHeatStatusSize, stream);
   }
 
   // The part of a substep up to the node temperatures, with the increments of an earlier solve where they are known.
@@ -101,11 +99,21 @@ class HeatSteps {
                              backend::Stream stream, const T* known = nullptr) {
     HeatToNodesArguments<T, D> down = s_.with_heat.to_nodes;
     if (!down.sums.pointer) {
-      make_nodes(stream);
-      down = to_nodes(x, mass, velocity_gradient);
+      down = begin_nodes(x, mass, velocity_gradient, stream);
       backend::heat_to_nodes(in_.lattice.order(), down, stream);
     }
-    find_largest(number_, scene, largest_, 1, stream);
+    return conduct(down, rest, scene, stream, known);
+  }
+
+  // The transfer to the nodes, whose sums are zero; then the rest of that part.
+  HeatToNodesArguments<T, D> begin_nodes(const Field<const T>& x, const Field<const T>& mass,
+                                         const Field<const T>& velocity_gradient, backend::Stream stream) {
+    make_nodes(stream);
+    return to_nodes(x, mass, velocity_gradient);
+  }
+  HeatSolution<T, D> conduct(const HeatToNodesArguments<T, D>& down, const Field<const T>& rest,
+                             const Field<const int>& scene, backend::Stream stream, const T* known = nullptr) {
+    const Field<const T>& x = down.x;
     if (holds_surface()) add_layers(x, scene, stream);
     if (!solves_for_sums()) means(stream);
     if (has_terms()) add_terms(x, rest, stream);
@@ -119,8 +127,18 @@ class HeatSteps {
     return {down, a, static_cast<const T*>(theta_.data_ptr())};
   }
 
-  // The transfer of these temperatures to the particles.
-  HeatToParticlesArguments<T, D> to_particles(const HeatToNodesArguments<T, D>& down);
+  // The transfer of these temperatures to the particles, to the other buffer of the fields or in place.
+  HeatToParticlesArguments<T, D> to_particles(const HeatToNodesArguments<T, D>& down, bool elsewhere);
+
+  // Whether particles may leave their base blocks while an activation lasts, on the CPU: not where sums over them other
+  // than those of `conduct` are needed.
+  static bool may_last(const SubstepsInputs& in) {
+    return in.heat_terms.empty() && in.heat_options[2] == 0 && in.heat_scalars[2] == 0 &&
+           (in.heat_boundaries.empty() || in.heat_boundaries[kPower].numel() == 0);
+  }
+
+  // Where G2P stores the present volumes of the next substep.
+  Field<T> volumes() { return column(fields.next(false), volume_); }
 
   // The first columns of the fields, which a call returns and a step reads.
   int state_columns() const { return volume_; }
@@ -189,6 +207,8 @@ class HeatSteps {
   void hold_nodes(HeatArguments<T, D>& a, backend::Stream stream);
   void read_parameter(const Tensor& t, const char* name);
   HeatValue<T> value(size_t k) const;
+  // Slots with nodes in use. On the CPU those with a block are first, where the activation counts them.
+  int64_t used_slots() const { return s_.activation.used_slots ? s_.used_slots : slots_; }
   void make_nodes(backend::Stream stream);
   void* workspace(backend::Stream stream);
   int64_t lay_out_cleared(T* memory, int64_t nodes);
@@ -198,15 +218,13 @@ class HeatSteps {
   void solve(HeatArguments<T, D>& a, backend::Stream stream);
   void use_increments(const HeatArguments<T, D>& a, const T* increments, backend::Stream stream);
   void solve_by_simple_steps(HeatArguments<T, D>& a, backend::Stream stream);
-  void find_largest(const Tensor& values, const Field<const int>& scene, double* to, int64_t stride,
-                    backend::Stream stream) const;
 
   Substeps<T, D>& s_;
   const SubstepsInputs& in_;
   int gradient_ = -1, liquid_ = -1, volume_ = 1, dissipated_ = -1;  // columns
   std::vector<HeatValue<T>> values_;  // of the parameters; those per particle have no pointer
   std::vector<int> own_;              // index in `parameters`, or -1
-  Tensor conductance_, blend_, number_, changing_;
+  Tensor conductance_, blend_, number_;
   bool has_volumes_ = false;
   Field<const T> temperatures_;   // of the held obstacles [K, B]
   Tensor exchange_of_particles_;  // with the held surface
@@ -254,8 +272,7 @@ HeatSteps<T, D>::HeatSteps(Substeps<T, D>& steps) : s_(steps), in_(steps.in) {
   if (has_power()) read_parameter(in_.heat_boundaries[kPower], "the power of heat");
   conductance_ = empty(x, {P});
   blend_ = empty(x, {P});
-  if (MPM_BACKEND == MPM_BACKEND_IS_cpu || melts()) number_ = empty(x, {P});
-  if (MPM_BACKEND == MPM_BACKEND_IS_cpu && melts()) changing_ = empty(x, {P});
+  if (melts()) number_ = empty(x, {P});
   status = empty(x, {in_.scenes, int64_t(kHeatStatusSize)}, ScalarType::Double);
   torch::stable::zero_(status);
   iterations_ = empty_int(x, {in_.scenes});
@@ -405,7 +422,14 @@ void HeatSteps<T, D>::make_nodes(backend::Stream stream) {
   }
   turn_ = kTurns - 1 - turn_;
   lay_out_cleared(static_cast<T*>(cleared_[turn_].data_ptr()), nodes);
-  if (MPM_BACKEND == MPM_BACKEND_IS_cpu) backend::clear(cleared_[turn_], stream);
+#if MPM_BACKEND == MPM_BACKEND_IS_cpu
+  const int64_t used = used_slots() * kBlockNodes<D>, scalar = sizeof(T);
+  clear_memory(largest_, in_.scenes * int64_t(sizeof(double)));
+  clear_memory(sums_, used * kHeatChannels * scalar);
+  for (T* const of_nodes : {exchange_, source_})
+    if (of_nodes) clear_memory(of_nodes, used * scalar);
+  if (surface_) clear_memory(surface_, used * kHeatChannels * scalar);
+#endif
 }
 
 // Returns the number of scalars.
@@ -446,13 +470,13 @@ HeatToNodesArguments<T, D> HeatSteps<T, D>::to_nodes(const Field<const T>& x, co
   a.conductance = field<T>(conductance_);
   a.blend = field<T>(blend_);
   a.number = field<T>(number_);
-  if (MPM_BACKEND == MPM_BACKEND_IS_cuda) a.largest = largest_;
+  a.largest = largest_;
   a.sums = {sums_, kHeatChannels, kHeatChannels};
   return a;
 }
 
 template <class T, int D>
-HeatToParticlesArguments<T, D> HeatSteps<T, D>::to_particles(const HeatToNodesArguments<T, D>& down) {
+HeatToParticlesArguments<T, D> HeatSteps<T, D>::to_particles(const HeatToNodesArguments<T, D>& down, bool elsewhere) {
   HeatToParticlesArguments<T, D> a;
   a.topology = down.topology;
   a.x = down.x;
@@ -467,30 +491,17 @@ HeatToParticlesArguments<T, D> HeatSteps<T, D>::to_particles(const HeatToNodesAr
   a.dt = down.dt;
   a.moment_scale = in_.lattice.inverse_inertia();
   a.nodes = {sums_ + kHeatTheta, kHeatChannels, kHeatChannels - kHeatTheta};
-  const Field<T> next = fields.next(true);
+  const Field<T> next = fields.next(elsewhere);
   a.theta = column(next, 0);
   a.gradient = column(next, gradient_);
   a.liquid = column(next, liquid_);
-  a.changing = field<T>(changing_);
-  if (MPM_BACKEND == MPM_BACKEND_IS_cuda) a.largest = rows_of_status() + kLargestFront;
+  a.largest = rows_of_status() + kLargestFront;
   return a;
-}
-
-// Raises `to` to the largest value of the particles of each scene. On CUDA the kernels that compute the values do that.
-template <class T, int D>
-void HeatSteps<T, D>::find_largest([[maybe_unused]] const Tensor& values,
-                                   [[maybe_unused]] const Field<const int>& scene, [[maybe_unused]] double* to,
-                                   [[maybe_unused]] int64_t stride, [[maybe_unused]] backend::Stream stream) const {
-#if MPM_BACKEND == MPM_BACKEND_IS_cpu
-  if (in_.scenes > 0)
-    backend::heat_largest(
-        HeatLargestArguments<T, D>{particles(), in_.scenes, field<const T>(values), scene, to, stride}, stream);
-#endif
 }
 
 template <class T, int D>
 void HeatSteps<T, D>::means(backend::Stream stream) {
-  HeatMeansArguments<T, D> a{slots_ * kBlockNodes<D>, sums_, static_cast<T*>(theta_.data_ptr()),
+  HeatMeansArguments<T, D> a{used_slots() * kBlockNodes<D>, sums_, static_cast<T*>(theta_.data_ptr()),
                              static_cast<T*>(capacity_.data_ptr())};
   if (held_nodes() > 0) {
     a.start = static_cast<T*>(start_.data_ptr());
@@ -570,7 +581,7 @@ template <class T, int D>
 HeatArguments<T, D> HeatSteps<T, D>::equations(const Field<const T>& x, backend::Stream stream) {
   HeatArguments<T, D> a;
   a.topology = s_.p2g.topology;
-  a.near_blocks = s_.activation.max_blocks;
+  a.near_blocks = int(MPM_BACKEND == MPM_BACKEND_IS_cpu ? used_slots() : s_.activation.max_blocks);
   a.x = x;
   a.conductance = field<const T>(conductance_);
   if (solves_for_sums()) {
@@ -620,7 +631,7 @@ void HeatSteps<T, D>::solve(HeatArguments<T, D>& a, backend::Stream stream) {
 // Uses the increments of a solve.
 template <class T, int D>
 void HeatSteps<T, D>::use_increments(const HeatArguments<T, D>& a, const T* increments, backend::Stream stream) {
-  backend::heat_increments(HeatIncrementsArguments<T, D>{slots_ * kBlockNodes<D>, increments, a.theta,
+  backend::heat_increments(HeatIncrementsArguments<T, D>{used_slots() * kBlockNodes<D>, increments, a.theta,
                                                          field<const T>(theta_).pointer, sums_},
                            stream);
 }

@@ -23,6 +23,7 @@ MPM_BACKEND_KERNELS(MPM_ROLLOUT_KERNELS)
 #define MPM_SORTED_CPU_KERNELS(PLAIN, ORDERED, SIZE) \
   ORDERED(laws_p2g, LawsP2GArguments)                \
   PLAIN(g2p2g_chunks, G2P2GChunksArguments)          \
+  PLAIN(heat_g2p_chunks, HeatG2PChunksArguments)     \
   PLAIN(longest_move, LongestMoveArguments)          \
   PLAIN(permute, PermuteArguments)
 MPM_BACKEND_KERNELS(MPM_SORTED_CPU_KERNELS)

@@ -71,6 +71,15 @@ MPM_HD void read(Advanced<P, D>& p, const AdvancedRows<T, D>& rows, const G& g) 
   p.J = rows.J ? load_row(rows.J.row[0], rows.J.stride, g) : P(0);
 }
 
+// The motion that `write_motion` has stored.
+template <class P, int D, class T, class G>
+MPM_HD void read_motion(Advanced<P, D>& p, const AdvancedRows<T, D>& rows, const G& g) {
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    p.v[i] = load_row(rows.v.row[i], rows.v.stride, g);
+  MPM_UNROLL for (int k = 0; k < D * D; k++)
+    p.affine[k / D][k % D] = load_row(rows.affine.row[k], rows.affine.stride, g);
+}
+
 template <class P, int D, class T, class G>
 MPM_HD void write_motion(const Advanced<P, D>& p, const AdvancedRows<T, D>& rows, const G& g) {
   MPM_UNROLL for (int i = 0; i < D; i++)

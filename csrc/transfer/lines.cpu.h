@@ -68,13 +68,13 @@ MPM_HD Sums<Lanes<T>, D - Axis> sum_lines(const Weights<2, Lanes<T>, D>& s, cons
   }
 }
 
-// As gather_channels, for D channels.
-template <bool Gradient, class T, int D>
-MPM_HD void gather_lines(const Lanes<T> f[D], const T* lines, Sums<Lanes<T>, D> sums[D]) {
+// As gather_channels, with moments.
+template <int Channels, bool Gradient, class T, int D>
+MPM_HD void gather_lines(const Lanes<T> f[D], const T* lines, Sums<Lanes<T>, D> sums[Channels]) {
   using P = Lanes<T>;
   const Weights<2, P, D> s(f, Gradient ? 1 : 0);
   const LastAxis<P> last(f[D - 1]);
-  MPM_UNROLL for (int c = 0; c < D; c++) {
+  MPM_UNROLL for (int c = 0; c < Channels; c++) {
     sums[c] = sum_lines<0, Gradient, T, D>(s, last, lines + c);
     MPM_UNROLL for (int a = 0; a + 1 < D; a++)
       sums[c].moment[a] = sums[c].moment[a] - (f[a] - P(1)) * sums[c].value;

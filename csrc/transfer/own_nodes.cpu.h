@@ -46,29 +46,45 @@ MPM_HD Node<T> load_node(const NodeRow<T, D>& row) {
 
 template <class T, int D>
 MPM_HD void add_to_node(NodeRow<T, D>& row, const Node<T>& sum) {
-  if constexpr (sizeof(row) == sizeof(sum)) return (load_node<T, D>(row) + sum).store(&row.mass);
+  if constexpr (sizeof(row) == sizeof(sum)) return (load_node(row) + sum).store(&row.mass);
   row.mass += sum[0];
   for (int i = 0; i < D; i++) row.value[i] += sum[1 + i];
 }
 
+// Rows of kChannels sums of nodes.
+template <class T>
+struct ChannelRow {
+  T value[kChannels];
+};
+
+template <class T>
+MPM_HD Node<T> load_node(const ChannelRow<T>& row) {
+  return Node<T>::load(row.value);
+}
+
+template <class T>
+MPM_HD void add_to_node(ChannelRow<T>& row, const Node<T>& sum) {
+  (load_node(row) + sum).store(row.value);
+}
+
 // As sum_nodes, for one particle, all channels at once.
-template <int Order, int Axis, bool Gradient, class T, int D>
-MPM_HD Sums<Node<T>, D - Axis> sum_own_nodes(const Weights<Order, Node<T>, D>& s, const NodeRow<T, D>* rows,
+template <int Order, int Axis, bool Gradient, class Row, class T, int D>
+MPM_HD Sums<Node<T>, D - Axis> sum_own_nodes(const Weights<Order, Node<T>, D>& s, const Row* rows,
                                              const NodesOf<Order, T, D>& nodes, int line = 0) {
   return sum_axis<Order, Axis, true, Gradient>(s, [&](int k) {
     if constexpr (Axis + 1 < D) {
       return sum_own_nodes<Order, Axis + 1, Gradient>(s, rows, nodes, nodes.S * line + k);
     } else {
       Sums<Node<T>, 0> node;
-      node.value = load_node<T, D>(rows[nodes.row[line][k]]);
+      node.value = load_node(rows[nodes.row[line][k]]);
       return node;
     }
   });
 }
 
 // Result of gather_channels, about the particle.
-template <int Order, bool Gradient, class T, int D>
-MPM_HD Sums<Node<T>, D> gather_own_nodes(const T f[D], const NodeRow<T, D>* rows, const NodesOf<Order, T, D>& nodes) {
+template <int Order, bool Gradient, class Row, class T, int D>
+MPM_HD Sums<Node<T>, D> gather_own_nodes(const T f[D], const Row* rows, const NodesOf<Order, T, D>& nodes) {
   Node<T> distance[D];
   MPM_UNROLL for (int a = 0; a < D; a++)
     distance[a] = Node<T>(f[a]);
@@ -79,9 +95,21 @@ MPM_HD Sums<Node<T>, D> gather_own_nodes(const T f[D], const NodeRow<T, D>* rows
   return sums;
 }
 
+// Sums of `Count` channels of a node from `First` on, each by itself.
+template <int First, bool Gradient, class T, int D, int Count>
+MPM_HD void split_channels(const Sums<Node<T>, D>& all, Sums<T, D> (&one)[Count]) {
+  for (int c = 0; c < Count; c++) {
+    one[c].value = all.value[First + c];
+    for (int a = 0; a < D; a++) {
+      one[c].moment[a] = all.moment[a][First + c];
+      if (Gradient) one[c].gradient[a] = all.gradient[a][First + c];
+    }
+  }
+}
+
 // As sum_cell, for particle p.
-template <int Order, bool Gradient, class T, int D>
-MPM_HD void add_to_own_nodes(const Contributions<Order, T, D, true, Gradient>& g, int p, NodeRow<T, D>* rows,
+template <int Order, bool Gradient, class Row, class T, int D>
+MPM_HD void add_to_own_nodes(const Contributions<Order, T, D, true, Gradient>& g, int p, Row* rows,
                              const NodesOf<Order, T, D>& nodes) {
   using G = Contributions<Order, T, D, true, Gradient>;
   constexpr int S = Order + 1;
@@ -103,7 +131,7 @@ MPM_HD void add_to_own_nodes(const Contributions<Order, T, D, true, Gradient>& g
     for (int k = 0; k < S; k++) {
       Node<T> sum = Node<T>(g.weight[k][p]) * (at_node(k, first, last) + across);
       if constexpr (Gradient) sum += Node<T>(g.slope[k][p]) * along;
-      add_to_node<T, D>(rows[nodes.row[l][k]], sum);
+      add_to_node(rows[nodes.row[l][k]], sum);
     }
   }
 }

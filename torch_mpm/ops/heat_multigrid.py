@@ -301,7 +301,7 @@ def heat_multigrid(
         p = z if k == 0 else torch.addcmul(z, scenes.spread(beta, x.dtype), p)
         Ap = levels[0].apply(p)
         curvature = scenes.sum(p * Ap)
-        running = running & (curvature > 0)
+        running = running & (curvature > 0) & (product != 0)  # zero where sums underflow
         alpha = scenes.spread(torch.where(running, product / curvature, 0), x.dtype)
         before, r = r, torch.addcmul(r, alpha, Ap, value=-1)
         d = torch.addcmul(d, alpha, p)

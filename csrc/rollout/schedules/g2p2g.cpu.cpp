@@ -5,73 +5,31 @@
 #include "cpu/cell_sort.h"
 #include "rollout/copies.cpu.h"
 #include "rollout/displacement_budget.cpu.h"
-#include "transfer/advance_chunk.cpu.h"
+#include "rollout/schedules/chunk_in_place.cpu.h"
+#include "rollout/schedules/heat_gather.cpu.h"
 #include "transfer/lines.cpu.h"
-#include "transfer/own_nodes.cpu.h"
 
 namespace mpm::cpu {
 inline namespace TORCH_MPM_ISA {
 namespace {
 
-// Quadratic splines: the nodes of particles up to one cell outside of their base blocks never overlap for two blocks of
-// one colour, and sums over the colours in turn have an order.
-constexpr int kOrder = 2;
+constexpr int kOrder = kOrderInPlace;
 
-// Number of cells along an axis in which the particles of a base block may be.
-constexpr int kNear = kBlockWidth + 2;
-
-// Up to kLanes particles of one cell, by ascending numbers in the chunk.
-struct GroupOfChunk {
-  int first, count;
-  bool loads_run, stores_run, whole;
-  Group group;  // if they are not consecutive
-
-  MPM_HD GroupOfChunk(const uint16_t* order, int rest, int particles)
-      : first(order[0] % kChunk), count(rest < kLanes ? rest : kLanes) {
-    stores_run = order[count - 1] % kChunk - first == count - 1;
-    loads_run = stores_run && first + kLanes <= particles;
-    whole = count == kLanes;
-    if (loads_run && (whole || kMasks)) return;
-    int id[kLanes];
-    for (int l = 0; l < count; l++) id[l] = order[l] % kChunk;
-    group = group_of<kLanes>(id, count);
-  }
-
-  template <class T>
-  MPM_HD Lanes<T> load(const T* row) const {
-    return loads_run ? Lanes<T>::load(row + first) : load_row(row, 1, group);
-  }
-  template <bool Gradient, class T, int D>
-  MPM_HD void put(Motion<Gradient, T, D>& motion, const Sums<Lanes<T>, D> s[D]) const {
-    if (stores_run && whole) return motion.put_by([&](const Lanes<T>& v, T* row) { v.store(row + first); }, s);
-#ifdef __AVX512VL__
-    if (stores_run)
-      return motion.put_by([&](const Lanes<T>& v, T* row) { v.store(row + first, (1u << count) - 1); }, s);
-#endif
-    motion.put_by([&](const Lanes<T>& v, T* row) { store_row(v, row, 1, group); }, s);
-  }
-
- private:
-#ifdef __AVX512VL__
-  static constexpr bool kMasks = true;
-#else
-  static constexpr bool kMasks = false;
-#endif
-};
-
-// The work of a thread on the chunks of its base blocks.
-template <bool Gradient, class T, int D>
+// The work of a thread on the chunks of its base blocks. With `Heat`, G2P of the velocities precedes it, and G2P of heat
+// takes its place.
+template <bool Gradient, bool Heat, class T, int D>
 class ChunkPass {
  public:
-  ChunkPass(const G2P2GChunksArguments<T, D>& a, T* copies)
+  ChunkPass(const G2P2GChunksArguments<T, D>& a, int thread)
       : a_(a),
         t_(a.advance.gather.topology),
-        schedule_(schedule_of(t_)),
+        chunk_(t_),
         rows_(a.advance),
         mass_(a.to_nodes.p2g.mass),
         volume_(a.to_nodes.p2g.volume),
+        heat_(a.heat),
         displacement_budget_(t_.geometry, a.follows ? a.to_nodes.whereabouts : nullptr),
-        copies_(a.to_nodes, copies) {
+        copies_(a.to_nodes, a.to_nodes.copies + a.to_nodes.copy_size * thread) {
     lay_out<D>(written_, a.to_nodes.schedule, t_.max_blocks, t_.particles);
   }
   ~ChunkPass() {
@@ -81,31 +39,29 @@ class ChunkPass {
   // `my_turn` waits for the sums of earlier colours.
   template <class F>
   void process(int64_t b, const F& my_turn) {
-    const BaseBlock<T, D> base_block(t_, schedule_.base_slot[b]);
+    const BaseBlock<T, D> base_block(t_, chunk_.schedule.base_slot[b]);
     displacement_budget_.begin(base_block);
-    velocities_.load_from(a_.advance.gather.nodes, base_block, 0, D);
-    lines_.load_from(velocities_);
-    if (a_.follows) momenta_.clear();
-    const int64_t chunks = schedule_.base_chunk[schedule_.colour_start[kColours<D>]];
-    for (int64_t c = schedule_.base_chunk[b]; c < schedule_.base_chunk[b + 1]; c++) {
-      const Chunk chunk(t_, schedule_, c), next(t_, schedule_, c + 1 < chunks ? c + 1 : c);
-      begin_ = int(chunk.id - t_.index);
-      count_ = chunk.count;
-      order_ = written_.order + begin_;
-      cell_end_ = written_.cell_end + c * kBlockNodes<D>;
-      gather(base_block, next);
-      for (int k = cell_end_[kBlockNodes<D> - 1]; k < count_; k++)
-        gather_out_of_block(base_block.scene, order_[k] % kChunk);
-      advance(base_block.scene);
-      if (!a_.follows) continue;
-      give(base_block);
-      sort();
-      sum_cells(contributions_, order_, cell_end_, momenta_);
-      for (int k = cell_end_[kBlockNodes<D> - 1]; k < count_; k++) {
-        my_turn();
-        add_one_out_of_block(base_block, order_[k]);
-      }
+    if constexpr (Heat) {
+      heat_.begin(base_block);
+    } else {
+      velocities_.load_from(a_.advance.gather.nodes, base_block, 0, D);
+      lines_.load_from(velocities_);
     }
+    if (a_.follows) momenta_.clear();
+    chunk_.for_chunks(b, [&](int64_t c, const Chunk& next) {
+      gather(base_block, next);
+      chunk_.for_out_of_block([&](int i) { gather_out_of_block(base_block.scene, i); });
+      advance(base_block.scene);
+      if (!a_.follows) return;
+      give(base_block);
+      sort(c);
+      sum_cells(contributions_, chunk_.order, chunk_.cell_end, momenta_);
+      chunk_.for_out_of_block([&](int i) {
+        my_turn();
+        add_one_out_of_block(base_block, i);
+      });
+    });
+    if constexpr (Heat) heat_.end(base_block.scene);
     if (!a_.follows) return;
     my_turn();
     momenta_.add_to(a_.to_nodes.p2g.nodes, base_block, 0, 1 + D);
@@ -115,14 +71,6 @@ class ChunkPass {
   static constexpr int N = kWideLanes<T>;
   using P = Pack<T, N>;
   using R = ChunkRows<D>;
-
-  // Calls f(number in the chunk, pack of particles from there on) for all packs.
-  template <class F>
-  MPM_HD void for_packs(const F& f) const {
-    int i = 0;
-    for (; i + N <= count_; i += N) f(i, RunOf<N>{begin_ + i});
-    if (i < count_) f(i, PartOf<N>{begin_ + i, count_ - i});
-  }
 
   // Distances of particles i, i + 1, ... from their base nodes, and their entries of cell_ and near_.
   MPM_HD void find_cells(int i, const BaseBlock<T, D>& base_block, const P x[D], P f[D]) {
@@ -150,34 +98,32 @@ class ChunkPass {
     __builtin_memcpy(to, &bytes, sizeof(bytes));
   }
 
-  void sort() {
+  // The solver of heat finds the cell of each particle in the order.
+  void sort(int64_t c) {
+    uint16_t* const order = written_.order + chunk_.begin;
     uint16_t end[kBlockNodes<D> + 1];
-    sort_by_cell<kBlockNodes<D> + 1>(cell_, count_, order_, end);
-    __builtin_memcpy(cell_end_, end, sizeof(*end) * kBlockNodes<D>);
+    sort_by_cell<kBlockNodes<D> + 1>(cell_, chunk_.count, order, end);
+    if (Heat)
+      for (int i = 0; i < chunk_.count; i++) order[i] = uint16_t(cell_[i] * kChunk + order[i]);
+    __builtin_memcpy(written_.cell_end + c * kBlockNodes<D>, end, sizeof(*end) * kBlockNodes<D>);
   }
 
   // Sums of G2P for the particles that are in their base block.
   void gather(const BaseBlock<T, D>& base_block, const Chunk& next) {
     int prefetched = 0;
-    for (int cell = 0, i = 0; cell < kBlockNodes<D>; cell++) {
-      int base[D];
-      for (int a = 0; a < D; a++) base[a] = cell_coordinate<D>(cell, a);
-      for (const int end = cell_end_[cell]; i < end; i += kLanes) {
-        const GroupOfChunk g(order_ + i, end - i, count_);
-        Lanes<T> f[D];
-        MPM_UNROLL for (int a = 0; a < D; a++)
-          f[a] = distance_in_cells(t_.geometry, a, g.load(rows_.x_next.row[a] + begin_),
-                                   Lanes<T>(T(base_block.corner[a] + base[a])));
+    chunk_.for_groups(rows_.x_next, base_block, [&](const GroupOfChunk& g, int i, const int base[D], const Lanes<T> f[D]) {
+      if constexpr (Heat) {
+        heat_.gather(g, base, f);
+      } else {
         const T* at = lines_.value + lines_.at(base);
         // Most cells have one group: otherwise the compiler would store nodes for a second one on the stack.
         asm volatile("" : "+r"(at));
         Sums<Lanes<T>, D> s[D];
-        gather_lines<Gradient, T, D>(f, at, s);
-        g.put(motion_, s);
-        for (; prefetched <= i; prefetched += 64 / int(sizeof(T))) prefetch(next, prefetched);
+        gather_lines<D, Gradient, T, D>(f, at, s);
+        g.template store_by<T>([&](const auto& store) { motion_.put_by(store, s); });
       }
-      i = cell_end_[cell];
-    }
+      for (; prefetched <= i; prefetched += 64 / int(sizeof(T))) prefetch(next, prefetched);
+    });
   }
 
   // Prefetches the cache lines of the i-th particle of the next chunk. (GCC removes calls of functions that only
@@ -191,22 +137,15 @@ class ChunkPass {
   void gather_out_of_block(int scene, int i) {
     int base[D];
     T f[D];
-    for (int a = 0; a < D; a++) {
-      const T x = rows_.x_next.row[a][begin_ + i], node = base_node<kOrder>(t_.geometry, a, x);
-      base[a] = int(node);
-      f[a] = distance_in_cells(t_.geometry, a, x, node);
-    }
+    chunk_.locate(rows_.x_next, i, base, f);
     const NodesOf<kOrder, T, D> nodes(t_, scene, base);
-    const Sums<Node<T>, D> own = gather_own_nodes<kOrder, Gradient>(f, a_.velocities, nodes);
-    Sums<T, D> s[D];
-    for (int c = 0; c < D; c++) {
-      s[c].value = own.value[1 + c];
-      for (int a = 0; a < D; a++) {
-        s[c].moment[a] = own.moment[a][1 + c];
-        if (Gradient) s[c].gradient[a] = own.gradient[a][1 + c];
-      }
+    if constexpr (Heat) {
+      heat_.gather_one(i, f, nodes);
+    } else {
+      Sums<T, D> s[D];
+      split_channels<1, Gradient>(gather_own_nodes<kOrder, Gradient>(f, a_.velocities, nodes), s);
+      motion_.put_by([&](const T& v, T* row) { row[i] = v; }, s);
     }
-    motion_.put_by([&](const T& v, T* row) { row[i] = v; }, s);
   }
 
   // By the cell of `find_cells`: its weights belong to these nodes, independent of rounding elsewhere.
@@ -222,26 +161,46 @@ class ChunkPass {
   void advance(int scene) {
     const P scale(a_.advance.gather.moment_scale * double(t_.geometry.dx)), inverse_dx(t_.geometry.inverse_dx);
     const P dt(time_step(a_.advance.scene_dt, a_.advance.dt, scene));
-    for_packs([&](int i, const auto& g) {
+    chunk_.template for_packs<N>([&](int i, const auto& g) {
       Advanced<P, D> p;
       Matrix<P, D> L;
-      motion_.get(i, scale, inverse_dx, p, L);
+      if constexpr (Heat) {
+        read_motion(p, rows_, g);
+        L = p.affine;
+        heat_.finish(i, g, scene, L);
+      } else {
+        motion_.get(i, scale, inverse_dx, p, L);
+      }
       read(p, rows_, g);
       end_step(p, L, dt, rows_);
       write_moved(p, rows_, g);
-      if (!a_.follows) return write_motion(p, rows_, g);
+      if (!a_.follows) {
+        if (!Heat) write_motion(p, rows_, g);
+        return;
+      }
+      if constexpr (Heat) {
+        put(present_volume(p, g), a_.volume_next, g);
+        MPM_UNROLL for (int k = 0; k < D; k++)
+          p.v[k].store(motion_.velocity[k] + i);
+      }
       MPM_UNROLL for (int k = 0; k < D * D; k++)
         p.affine[k / D][k % D].store(motion_.affine[k / D][k % D] + i);
     });
   }
 
+  template <class G>
+  MPM_HD P present_volume(const Advanced<P, D>& p, const G& g) const {
+    const P rest = load_row(volume_.row[0], 1, g);
+    return rows_.J ? rest * p.J : rows_.F ? rest * determinant(p.F) : rest;
+  }
+
   // Laws, and contributions of the particles to the nodes.
   void give(const BaseBlock<T, D>& base_block) {
     const P2GArguments<T, D>& p2g = a_.to_nodes.p2g;
-    copies_.fetch_run(begin_, count_, motion_.affine[0][0], motion_.kLine);
+    copies_.fetch_run(chunk_.begin, chunk_.count, motion_.affine[0][0], motion_.kLine);
     copies_.apply_laws();
     const P dt(time_step(p2g.scene_dt, p2g.dt, base_block.scene));
-    for_packs([&](int i, const auto& g) {
+    chunk_.template for_packs<N>([&](int i, const auto& g) {
       P x[D], f[D];
       ParticleMomentum<P, D> p;
       p.mass = load_row(mass_.row[0], 1, g);
@@ -255,7 +214,7 @@ class ChunkPass {
       }
       p.stress = load_matrix_or_zero<T, D>(copies_.field(R::stress), RunOf<N>{i});
       find_cells(i, base_block, x, f);
-      displacement_budget_.add(x, count_ - i);
+      displacement_budget_.add(x, chunk_.count - i);
       contributions_.put(i, f, momentum_contribution<kOrder, true, Gradient>(t_.geometry, p, f));
     });
     copies_.leave();
@@ -263,13 +222,13 @@ class ChunkPass {
 
   const G2P2GChunksArguments<T, D>& a_;
   const Topology<T, D>& t_;
-  const ScheduleIn schedule_;
+  ChunkInPlace<T, D> chunk_;
   const AdvancedRows<T, D> rows_;
   const FieldRows<const T, 1> mass_, volume_;
+  std::conditional_t<Heat, HeatGather<T, D>, NoHeatGather<T, D>> heat_;
   DisplacementBudget<T, D> displacement_budget_;
-  int out_of_block_ = 0, begin_ = 0, count_ = 0;
+  int out_of_block_ = 0;
   ScheduleOut written_;  // its orders and cells, chunk by chunk
-  uint16_t *order_ = nullptr, *cell_end_ = nullptr;
   // For each particle of the chunk: its cell in the base block, kBlockNodes if it is in another block; and its cell
   // among the kNear^D cells around.
   uint8_t cell_[kChunk + N], near_[kChunk + N];
@@ -280,32 +239,22 @@ class ChunkPass {
   Tile<kOrder, T, D> momenta_, velocities_;
 };
 
-template <bool Gradient, class T, int D>
+template <bool Gradient, bool Heat, class T, int D>
 void g2p2g_with(const G2P2GChunksArguments<T, D>& a) {
-  const Topology<T, D>& t = a.advance.gather.topology;
-  const ScheduleIn s = schedule_of(t);
-  PhaseCounter<kColours<D>> colours{s.colour_start};
-  int taken = 0;
-  parallel_base_blocks<D>(s, t.particles, [&](const auto& next) {
-    const LawsP2GArguments<T, D>& to = a.to_nodes;
-    ChunkPass<Gradient, T, D> pass(a, to.copies + to.copy_size * __atomic_fetch_add(&taken, 1, __ATOMIC_RELAXED));
-    int colour = 0;
-    for (int64_t b; (b = next()) >= 0;) {
-      while (b >= s.colour_start[colour + 1]) colour++;
-      pass.process(b, [&] { colours.wait_before(colour); });
-      colours.finish(colour);
-    }
-  });
+  for_base_blocks_in_turn(a.advance.gather.topology,
+                          [&](int thread) { return ChunkPass<Gradient, Heat, T, D>(a, thread); });
 }
 
 }  // namespace
 
 template <class T, int D>
 void g2p2g_chunks(const G2P2GChunksArguments<T, D>& a) {
-  if (a.advance.form == StressForm::gradient)
-    g2p2g_with<true>(a);
+  if (a.heat)
+    g2p2g_with<false, true>(a);
+  else if (a.advance.form == StressForm::gradient)
+    g2p2g_with<true, false>(a);
   else
-    g2p2g_with<false>(a);
+    g2p2g_with<false, false>(a);
   const Topology<T, D>& t = a.advance.gather.topology;
   const int first = t.offsets[t.max_blocks];
   if (!a.follows || a.fresh) skip_outside(a.advance);

@@ -25,10 +25,12 @@ class SortedCpu {
   // - deterministic grids: the length of an activation depends on all scenes, and affects the rounding of each;
   // - gradients through a pool that does not grow, since they need room for the blocks of every substep;
   // - FLIP, which needs the velocities of particles before the forces, and a pass does not store them;
-  // - heat, whose solve is between G2P and the next step.
+  // - heat with sums over particles that are transferred with their base blocks (`HeatSteps::may_last`).
+  // The solve of heat is between G2P and the next step: G2P of the velocities is then in a pass of its own, with P2G of
+  // heat, and G2P of heat is in the pass with the next P2G.
   static bool may_last(const SubstepsInputs& in) {
     return in.lattice.order() == 2 && in.n > kLeastLastingSteps && !in.lattice.deterministic() &&
-           (in.grows || in.resident) && in.flip() == 0 && !HeatSteps<T, D>::wanted(in);
+           (in.grows || in.resident) && in.flip() == 0 && (!HeatSteps<T, D>::wanted(in) || HeatSteps<T, D>::may_last(in));
   }
 
   // One substep, with `following` further ones; false as for `Substeps::activate`.
@@ -61,7 +63,8 @@ class SortedCpu {
   bool reaches();
   void give_to_nodes(bool rearranges);
   void set_p2g();
-  void set_advance();
+  void set_advance(bool elsewhere);
+  void conduct();
   void pass(bool follows);
   void find_rows(bool rearranges);
   void find_prefetched(bool motion);
@@ -99,6 +102,7 @@ class SortedCpu {
   std::vector<ParticleRow<int>> numbers_;
   std::vector<const T*> prefetched_;
   LawsP2GArguments<T, D> a_;
+  HeatToParticlesArguments<T, D> heat_to_particles_;
   Tensor copies_ = absent();
   int copied_rows_ = 0;
   bool reads_F_ = false, reads_J_ = false, viscous_ = false, rearranged_ = false;
@@ -247,6 +251,7 @@ bool SortedCpu<T, D>::step(const int* status_before, int* status, int64_t follow
     return false;
   s_.move_nodes(stream_);
   lasts_ = lasts(following);
+  if (heat && (lasts_ || passes_ > 0)) conduct();
   if (!lasts_) advance();  // heat reads the obstacles of this time
   s_.end_time(stream_);
   return true;
@@ -402,25 +407,37 @@ void SortedCpu<T, D>::set_p2g() {
   a_.schedule = s_.activation.schedule;
 }
 
+// Sets the arguments of G2P; the new positions are in the other buffer or in place.
 template <class T, int D>
-void SortedCpu<T, D>::set_advance() {
+void SortedCpu<T, D>::set_advance(bool elsewhere) {
   G2PAdvanceArguments<T, D>& a = s_.advance;
   a.gather.x = x.now();
   a.F = F.now();
   a.J = J.now();
   a.residual = residual.now();
   a.gather.value = v.next(false);
-  a.x_next = x.next(heat.has_value());  // heat needs the positions before the step
+  a.x_next = x.next(elsewhere);
   if (in_.wants_C) a.gather.moment = C.next(false);
   if (has(in_.F)) a.F_next = F.next(false);
   if (has(in_.J)) a.J_next = J.next(false);
   if (has(in_.residual)) a.residual_next = residual.next(false);
 }
 
+// G2P of the velocities and conduction of heat, while an activation lasts.
+template <class T, int D>
+void SortedCpu<T, D>::conduct() {
+  set_advance(false);
+  const Field<const T> gradients = constant(s_.advance.gather.moment);
+  const HeatToNodesArguments<T, D> down = heat->begin_nodes(x.now(), mass_.now(), gradients, stream_);
+  backend::heat_g2p_chunks(HeatG2PChunksArguments<T, D>{s_.advance, s_.velocities(), down}, stream_);
+  heat->conduct(down, volume_.now(), scene_.now(), stream_);
+  heat_to_particles_ = heat->to_particles(down, false);
+}
+
 // G2P of the previous substep, then laws and P2G of this one if `follows`.
 template <class T, int D>
 void SortedCpu<T, D>::pass(bool follows) {
-  set_advance();
+  set_advance(false);
   if (passes_ == 0) {
     v.go(false);  // values of particles outside; those of others are not read before the last pass
     if (in_.wants_C) C.go(false);
@@ -435,22 +452,27 @@ void SortedCpu<T, D>::pass(bool follows) {
   a.sums = static_cast<NodeRow<T, D>*>(s_.pool.nodes.data_ptr());
   a.follows = follows;
   a.fresh = passes_++ == 0;
+  if (heat) {
+    a.heat = &heat_to_particles_;
+    a.volume_next = heat->volumes();
+  }
   backend::g2p2g_chunks(a, stream_);
 }
 
 template <class T, int D>
 void SortedCpu<T, D>::advance() {
+  const bool elsewhere = heat && passes_ == 0;  // heat then needs the positions before the step
   if (passes_ > 0) {
     pass(false);
   } else {
-    set_advance();
+    set_advance(elsewhere);
     backend::g2p_advance(in_.lattice.order(), s_.advance, stream_);
     if (s_.flips()) s_.add_flip(kept_.now(), stream_);
     if (heat) heat->run(x.now(), mass_.now(), volume_.now(), constant(s_.advance.gather.moment), scene_.now(), stream_);
   }
   moved_ |= heat.has_value();
   v.go(false);
-  x.go(heat.has_value());
+  x.go(elsewhere);
   if (in_.wants_C) C.go(false);
   if (has(in_.F)) F.go(false);
   if (has(in_.J)) J.go(false);
