@@ -82,21 +82,17 @@ struct LoneContact {
   }
   MPM_HD Vector<double, D> impulse() const { return as_double((T(0) - node.mass) * change()); }
 
-  // Derivative of the impulse, in rows, by the velocity of the surface.
-  MPM_HD Matrix<double, D> slope() const {
-    Matrix<double, D> result;
-    MPM_UNROLL for (int axis = 0; axis < D; axis++) {
-      Vector<T, D> unit = zero_vector<T, D>();
-      unit[axis] = T(1);
-      const Vector<T, D> kept = contact_adjoint(pose.contact, u, node.normal, pose.row->friction, unit);
-      MPM_UNROLL for (int by = 0; by < D; by++)
-        result[axis][by] = double(node.mass * (kept[by] - unit[by]));
-    }
-    return result;
+  // Derivative of a component of the impulse by the velocity of the surface.
+  MPM_HD Vector<double, D> slope(int axis) const {
+    Vector<T, D> unit;
+    MPM_UNROLL for (int i = 0; i < D; i++)
+      unit[i] = T(i == axis);
+    const Vector<T, D> kept = contact_adjoint(pose.contact, u, node.normal, pose.row->friction, unit);
+    return as_double(node.mass * (kept + T(-1) * unit));
   }
 };
 
-// A node that meets an obstacle alone, as `touch` has it.
+// A node that meets an obstacle alone, by its row and its place.
 template <class T, int D>
 MPM_HD LoneNode<T, D> lone_node(const ContactArguments<T, D>& a, const T* velocity, int64_t stride, int node,
                                 const Vector<int, D>& lattice, int obstacle, const Vector<T, D>& normal) {
@@ -148,20 +144,31 @@ MPM_HD void set_faces(const ContactArguments<T, D>& a, const BodyNode<T, D>& nod
   push.position = as_double(node.position);
 }
 
-// Sets the impulses of a node with a mass and a velocity before contact.
+// The velocities that the surfaces take from a node.
 template <class T, int D>
-MPM_HD_CALL void set_impulses(bool wanted, const BodyNode<T, D>& node, const T& mass, const Vector<T, D>& v,
-                              NodePush<T, D>& push) {
-  if (!wanted) return;
-  const Constraints<T, D>& c = node.met.constraints;
-  TakenVelocities<T, D> taken;
-  take_velocities(c, node.met.sign, v, taken);
+MPM_HD_CALL void take_from_node(bool wanted, const BodyNode<T, D>& node, const Vector<T, D>& v,
+                                TakenVelocities<T, D>& taken) {
+  if (wanted) take_velocities(node.met.constraints, node.met.sign, v, taken);
+}
+
+// Sets the impulses of a node by its mass.
+template <class T, int D>
+MPM_HD void set_impulses(const BodyNode<T, D>& node, const T& mass, const TakenVelocities<T, D>& taken,
+                         NodePush<T, D>& push) {
   MPM_LOOP for (int i = 0; i < taken.count; i++) {
-    const bool is_wall = c.e[i].owner < 0;
+    const bool is_wall = node.met.constraints.e[i].owner < 0;
     T(&impulse)[D] = push.impulse[is_wall ? 0 : i];
     MPM_UNROLL for (int axis = 0; axis < D; axis++)
       impulse[axis] = (is_wall ? impulse[axis] : T(0)) + mass * taken.taken[i][axis];
   }
+}
+
+// The velocity v of a node after contact.
+template <class T, int D>
+MPM_HD Vector<T, D> without(const TakenVelocities<T, D>& taken, Vector<T, D> v) {
+  MPM_LOOP for (int i = 0; i < taken.count; i++)
+    v = v + T(-1) * taken.taken[i];
+  return v;
 }
 
 // Sets the derivatives of the impulses of a node by the velocity of a face along an axis, by dual numbers.
@@ -190,12 +197,6 @@ MPM_HD_CALL void set_slopes(bool wanted, const BodyNode<T, D>& node, const T& ma
   }
 }
 
-// Replaces the velocity of a node by that after contact.
-template <class T, int D>
-MPM_HD_CALL void change_velocity(bool wanted, const BodyNode<T, D>& node, Vector<T, D>& v) {
-  if (wanted) v = node.met.after(v);
-}
-
 // ---- sums over nodes: impulses on the motions of bodies, and their derivatives
 
 template <int D>
@@ -204,36 +205,34 @@ MPM_HD Vector<double, D> arm_from(const BodyNow<D>& b, const Vector<double, D>& 
 }
 
 // Derivative of an impulse at arm `at` along the motions i of a body, by the motions j of a body at arm `by`, as number
-// i n + j; `slope` is that by the velocity there, in rows.
-template <int D>
-MPM_HD void set_slope_block(const Matrix<double, D>& slope, const Vector<double, D>& at, const Vector<double, D>& by,
+// i n + j; `slope(axis)` is that of a component by the velocity there.
+template <int D, class Slope>
+MPM_HD void set_slope_block(const Slope& slope, const Vector<double, D>& at, const Vector<double, D>& by,
                             double (&block)[kMotions<D> * kMotions<D>]) {
   constexpr int n = kMotions<D>;
   double rows[D][n];
-  MPM_UNROLL for (int p = 0; p < D; p++) {
-    Vector<double, D> row;
-    MPM_UNROLL for (int q = 0; q < D; q++)
-      row[q] = slope[p][q];
-    set_along_motions(by, row, rows[p]);
-  }
+  MPM_LOOP for (int axis = 0; axis < D; axis++)
+    set_along_motions(by, slope(axis), rows[axis]);
   MPM_UNROLL for (int j = 0; j < n; j++) {
     Vector<double, D> column;
     double along[n];
-    MPM_UNROLL for (int p = 0; p < D; p++)
-      column[p] = rows[p][j];
+    MPM_UNROLL for (int axis = 0; axis < D; axis++)
+      column[axis] = rows[axis][j];
     set_along_motions(at, column, along);
     MPM_UNROLL for (int i = 0; i < n; i++)
       block[i * n + j] = along[i];
   }
 }
 
-// Of one face of a node, by the velocity of another one along an axis.
+// Of one face of a node, by the velocity of another one along an axis, for `set_slope_block`.
 template <class T, int D>
-MPM_HD Matrix<double, D> slope_by_axis(const PushSlope<T, D>& slope, int face, int by_axis) {
-  Matrix<double, D> result;
-  MPM_UNROLL for (int p = 0; p < D; p++) MPM_UNROLL
-    for (int q = 0; q < D; q++) result[p][q] = q == by_axis ? double(slope.of[face][p]) : 0;
-  return result;
+MPM_HD auto slope_by_axis(const PushSlope<T, D>& slope, int face, int by_axis) {
+  return [&slope, face, by_axis](int axis) {
+    Vector<double, D> row;
+    MPM_UNROLL for (int i = 0; i < D; i++)
+      row[i] = i == by_axis ? double(slope.of[face][axis]) : 0;
+    return row;
+  };
 }
 
 }  // namespace TORCH_MPM_ISA

@@ -47,7 +47,9 @@ struct OneThread {
       const int k = a.owner[node.obstacle];
       const auto at = arm_from(scene.now[k], contact.at);
       if (impulses) add_impulse(at, contact.impulse(), impulses + k * n);
-      if (slopes) add_slopes(contact.slope(), at, arm_from(scene.now[k], contact.position), k, k, slopes);
+      if (slopes)
+        add_slopes([&](int axis) { return contact.slope(axis); }, at, arm_from(scene.now[k], contact.position), k, k,
+                   slopes);
     }
     each_other(scene, [&](const BodyNode<T, D>& node, const T& mass, const Vector<T, D>& v) {
       NodePush<T, D> push;
@@ -64,9 +66,10 @@ struct OneThread {
       const Vector<T, D> v = node.velocity + LoneContact<T, D>(a.contact, scene.poses, node).change();
       std::copy_n(v.e, D, a.velocity + node.node * a.stride);
     }
-    each_other(scene, [&](const BodyNode<T, D>& node, const T&, Vector<T, D> v) {
-      change_velocity(true, node, v);
-      std::copy_n(v.e, D, a.velocity + node.node * a.stride);
+    each_other(scene, [&](const BodyNode<T, D>& node, const T&, const Vector<T, D>& v) {
+      TakenVelocities<T, D> taken;
+      take_from_node(true, node, v, taken);
+      std::copy_n(without(taken, v).e, D, a.velocity + node.node * a.stride);
     });
   }
 
@@ -89,7 +92,9 @@ struct OneThread {
   template <class Scene>
   void add_impulses(const Scene& scene, const BodyNode<T, D>& node, const T& mass, const Vector<T, D>& v,
                     NodePush<T, D>& push, double* sums) const {
-    set_impulses(true, node, mass, v, push);
+    TakenVelocities<T, D> taken;
+    take_from_node(true, node, v, taken);
+    set_impulses(node, mass, taken, push);
     for (int face = 0; face < push.faces; face++) {
       const int k = a.owner[push.obstacle[face]];
       Vector<double, D> impulse;
@@ -112,8 +117,9 @@ struct OneThread {
     }
   }
 
-  void add_slopes(const Matrix<double, D>& slope, const Vector<double, D>& at, const Vector<double, D>& by, int k,
-                  int l, double* sums) const {
+  template <class Slope>
+  void add_slopes(const Slope& slope, const Vector<double, D>& at, const Vector<double, D>& by, int k, int l,
+                  double* sums) const {
     const int m = a.bodies * n;
     double block[n * n];
     set_slope_block(slope, at, by, block);

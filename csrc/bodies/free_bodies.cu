@@ -13,7 +13,7 @@ namespace {
 // Threads of a block: a warp for each of many scenes, so that all run at once; and more where a scene is alone or
 // large.
 constexpr int kFewThreads = 32, kSomeThreads = 128, kManyThreads = 512;
-constexpr int kManyScenes = 512, kManySlots = 256;  // the slots of a scene on average
+constexpr int kManyScenes = 256, kManySlots = 256;  // the slots of a scene on average
 // Nodes per slot, on average over a scene, whose surfaces are stored; those of others are found in every pass.
 constexpr int kRoom = 8;
 template <int D>
@@ -145,11 +145,13 @@ struct BlockTeam {
   double* sums;                                   // [adders, m + m²] in shared memory
   int* of_warps;                                  // [kWarps] in shared memory
   int near_count = 0, count = 0, lone_count = 0;  // of slots, and of nodes in contact
+  bool overflows = false;                         // whether there was no room for lone nodes
 
   static constexpr int n = kMotions<D>, kWarps = kThreads / 32;
 
   template <class F>
   __device__ void each(int items, const F& f) const {
+#pragma unroll 1
     for (int i = threadIdx.x; i < items; i += kThreads) f(i);
   }
   __device__ static void sync() { kWarps == 1 ? __syncwarp() : __syncthreads(); }
@@ -168,7 +170,7 @@ struct BlockTeam {
     const int warp = int(threadIdx.x) / 32;
     if (lane() == 0) of_warps[warp] = __popc(flags);
     __syncthreads();
-    for (int w = 0; w < kWarps; w++) {
+    MPM_LOOP for (int w = 0; w < kWarps; w++) {
       if (w < warp) before += of_warps[w];
       total += of_warps[w];
     }
@@ -238,11 +240,7 @@ struct BlockTeam {
     const bool wanted = i < candidates;
     const int entry = wanted ? list[i] : 0;
     NodeTouch<T, D> touch;
-    if (wanted) {
-      const NearSlot<D>& slot = slot_of(entry);
-      touch =
-          touch_of_parts(a.contact, memory.poses, slot.parts, node_position(a.contact, slot.corner, local_of(entry)));
-    }
+    find_touch_of(wanted, entry, touch);
     const bool meets = add_lone(touch.obstacle >= 0, entry, touch.obstacle, touch.normal);
     const bool keeps = meets || touch.obstacle == touch.several;
     const int at = place(keeps, several);  // a thread has read its candidate by then
@@ -251,7 +249,10 @@ struct BlockTeam {
 
   // Stores nodes that meet one surface. Returns whether there is no room for a node.
   __device__ bool add_lone(bool wanted, int entry, int obstacle, const Vector<T, D>& normal) {
-    if (lone_count + kThreads > lone_room) return wanted;
+    if (lone_count + kThreads > lone_room) {
+      overflows = true;
+      return wanted;
+    }
     const int at = place(wanted, lone_count);
     if (wanted)
       lone[at] = lone_node(a.contact, a.velocity, a.stride, node_of(entry),
@@ -267,7 +268,7 @@ struct BlockTeam {
     BodyNode<T, D> node;
     node.met.any = 0;
     if (any_of_warp(wanted)) {
-      search_node(wanted, entry, node);
+      search_node(wanted, !overflows, entry, node);
       join_warp();
     }
     const bool meets = wanted && node.met.any, single = meets && is_lone(a.contact, node);
@@ -278,8 +279,21 @@ struct BlockTeam {
     if (keeps && at < room) nodes[at] = node;
   }
 
-  // The surfaces of a node, if it meets any. By all threads of a warp, as `any_of_warp`.
-  __device__ __noinline__ void search_node(bool wanted, int entry, BodyNode<T, D>& result) const {
+  __device__ __noinline__ void find_touch_of(bool wanted, int entry, NodeTouch<T, D>& touch) const {
+    if (!wanted) return;
+    const NearSlot<D>& slot = slot_of(entry);
+    touch = touch_of_parts(a.contact, memory.poses, slot.parts, node_position(a.contact, slot.corner, local_of(entry)));
+  }
+
+  // The surfaces of a node, if it meets any; `several` where it is known that it may meet several. By all threads of a
+  // warp, as `any_of_warp`.
+  __device__ __noinline__ void search_node(bool wanted, bool several, int entry, BodyNode<T, D>& result) const {
+    NodeTouch<T, D> touch;
+    const bool touches = wanted && !several;
+    if (any_of_warp(touches)) {
+      find_touch_of(touches, entry, touch);
+      join_warp();
+    }
     const NearSlot<D>& slot = slot_of(entry);
     ContactSlot<T, D> s{true, slot.parts.walled, scene, {}, slot.parts.near, slot.parts.touching, memory.rows};
 #pragma unroll
@@ -288,13 +302,12 @@ struct BlockTeam {
     const int local = local_of(entry);
     const Vector<T, D> position = node_position(a.contact, s.corner, local);
     NodeContact<T, D> contact;
-    const NodeTouch<T, D> touch = touch_of_parts(a.contact, memory.poses, slot.parts, position);
-    const bool several = wanted && touch.obstacle == touch.several;
+    several = wanted && (several || touch.obstacle == touch.several);
     if (any_of_warp(several)) {
       find_surfaces(several, poses, position, contact);
       join_warp();
     }
-    if (wanted && touch.obstacle >= 0) meet_alone(a.contact, memory.poses, touch.obstacle, position, contact);
+    if (touch.obstacle >= 0) meet_alone(a.contact, memory.poses, touch.obstacle, position, contact);
     const bool meets = wanted && contact.count > 0;
     if (any_of_warp(meets)) {
       set_body_node(meets, poses, contact, node_of(entry), local, result);
@@ -304,10 +317,10 @@ struct BlockTeam {
 
   // Node number i of those that are not lone, with the velocities of its surfaces, its mass and its velocity. By all
   // threads of a warp.
-  __device__ void load(bool wanted, int i, BodyNode<T, D>& node, T& mass, Vector<T, D>& v) const {
+  __device__ __noinline__ void load(bool wanted, int i, BodyNode<T, D>& node, T& mass, Vector<T, D>& v) const {
     const bool searches = wanted && i >= room;
     if (any_of_warp(searches)) {
-      search_node(searches, list[searches ? i : 0], node);
+      search_node(searches, false, list[searches ? i : 0], node);
       join_warp();
     }
     mass = T(0);
@@ -349,7 +362,8 @@ struct BlockTeam {
     if (adders == 1) return;
     each(entries, [&](int e) {
       double sum = 0;
-      for (int w = 0; w < adders; w++) sum += sums[w * entries + e];
+      MPM_LOOP for (int w = 0; w < adders; w++)
+        sum += sums[w * entries + e];
       (e < of_impulses ? impulses[e] : slopes[e - of_impulses]) = sum;
     });
     sync();
@@ -375,7 +389,9 @@ struct BlockTeam {
       k = a.owner[node.obstacle];
       const Vector<double, D> at = arm_from(memory.now[k], contact.at);
       set_along_motions(at, contact.impulse(), along);
-      if (slopes) set_slope_block(contact.slope(), at, arm_from(memory.now[k], contact.position), block);
+      if (slopes)
+        set_slope_block([&](int axis) { return contact.slope(axis); }, at, arm_from(memory.now[k], contact.position),
+                        block);
     }
     if (impulses) add_by_key(k, along, [&](int body, int e) { return impulses + (body * n + e); });
     if (slopes) add_block(k, k, block, slopes);
@@ -383,9 +399,10 @@ struct BlockTeam {
 
   // Adds blocks of lanes for the bodies k and l, negative where there is none.
   __device__ void add_block(int k, int l, const double (&block)[n * n], double* slopes) const {
-    const int bodies = a.bodies;
-    add_by_key(k < 0 ? -1 : k * bodies + l, block, [&](int pair, int e) {
-      return slopes + (int64_t(pair / bodies * n + e / n) * (bodies * n) + pair % bodies * n + e % n);
+    static_assert(kMaxObstacles <= 256);
+    const int m = a.bodies * n;
+    add_by_key(k < 0 ? -1 : k << 8 | l, block, [&](int pair, int e) {
+      return slopes + (int64_t((pair >> 8) * n + e / n) * m + (pair & 255) * n + e % n);
     });
   }
 
@@ -397,12 +414,16 @@ struct BlockTeam {
     T mass;
     Vector<T, D> v;
     load(wanted, i, node, mass, v);
+    TakenVelocities<T, D> taken;
     if (any_of_warp(wanted)) {
-      set_impulses(wanted, node, mass, v, push);
+      take_from_node(wanted, node, v, taken);
       join_warp();
     }
-    if (wanted) set_faces(a.contact, node, push);
-    for (int face = 0; face < D; face++) {
+    if (wanted) {
+      set_impulses(node, mass, taken, push);
+      set_faces(a.contact, node, push);
+    }
+    MPM_LOOP for (int face = 0; face < D; face++) {
       const int k = wanted && face < push.faces ? a.owner[push.obstacle[face]] : -1;
       double along[n];
       if (k >= 0) {
@@ -433,7 +454,7 @@ struct BlockTeam {
       join_warp();
     }
     const int l = acts ? a.owner[push.obstacle[by]] : -1;
-    for (int face = 0; face < D; face++) {
+    MPM_LOOP for (int face = 0; face < D; face++) {
       const int k = acts && face < push.faces ? a.owner[push.obstacle[face]] : -1;
       double block[n * n];
       if (k >= 0)
@@ -456,11 +477,12 @@ struct BlockTeam {
       T mass;
       Vector<T, D> v;
       load(wanted, i, node, mass, v);
+      TakenVelocities<T, D> taken;
       if (any_of_warp(wanted)) {
-        change_velocity(wanted, node, v);
+        take_from_node(wanted, node, v, taken);
         join_warp();
       }
-      if (wanted) store(node.node, v);
+      if (wanted) store(node.node, without(taken, v));
     }
   }
 

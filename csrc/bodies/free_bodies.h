@@ -74,8 +74,8 @@ MPM_HD void solve_in_place(const Team& team, double* matrix, int m) {
     int pivot = k;
     MPM_LOOP for (int i = k + 1; i < m; i++)
       if (abs(matrix[i * width + k]) > abs(matrix[pivot * width + k])) pivot = i;
-    team.sync();
     if (pivot != k) {
+      team.sync();  // all have read the column
       team.each(width - k, [&](int j) {
         double &upper = matrix[k * width + k + j], &lower = matrix[pivot * width + k + j];
         const double kept = upper;
@@ -84,9 +84,10 @@ MPM_HD void solve_in_place(const Team& team, double* matrix, int m) {
       team.sync();
     }
     const int columns = m - k;
+    const double inverse = 1 / matrix[k * width + k];
     team.each((m - 1) * columns, [&](int e) {
       const int other = e / columns, i = other < k ? other : other + 1, j = k + 1 + e % columns;
-      matrix[i * width + j] -= matrix[i * width + k] / matrix[k * width + k] * matrix[k * width + j];
+      matrix[i * width + j] -= matrix[i * width + k] * inverse * matrix[k * width + j];
     });
     team.sync();
   }
@@ -216,7 +217,7 @@ class SceneBodies {
   }
 
   // Impulses, residual U − U* − W p and its size for each body, of velocities U; and the slopes, unless null.
-  MPM_HD void evaluate(const double* U, double* impulse, double* residual, double* size, double* slopes) {
+  MPM_HD_CALL void evaluate(const double* U, double* impulse, double* residual, double* size, double* slopes) {
     move_parts(U);
     team_.add_up(*this, impulse, slopes);
     team_.each(a.bodies, [&](int k) {
