@@ -76,7 +76,7 @@ class BodiesCall {
 
   FreeBodiesArguments<T, D> a_;
   std::vector<Tensor> given_;  // as long as the call lasts
-  Tensor table_, rows_, report_, workspace_ = absent();
+  Tensor rows_, report_, workspace_ = absent();
 };
 
 // Contiguous numbers of a shape.
@@ -125,11 +125,6 @@ void BodiesCall<T, D>::set_obstacles(const BodiesInputs& in, const Tensor& like,
                                         std::vector<double>(count, always), {}, 0);
   check_scenes(a_.contact, scenes);
   STD_TORCH_CHECK(a_.contact.obstacles > 0, "bodies must have obstacles, got none");
-  a_.given = a_.contact.row;
-  a_.given_rows = a_.contact.rows;
-  table_ = empty(like, {scenes, a_.contact.obstacles, ObstacleRow<T, D>::width});
-  a_.contact.row = a_.row = static_cast<ObstacleRow<T, D>*>(table_.data_ptr());
-  a_.contact.rows = int(scenes);
   STD_TORCH_CHECK(in.owner.size() == count, "body_owner must have an entry per obstacle, ", count, ", got ",
                   in.owner.size());
 }

@@ -4,9 +4,20 @@
 #include "grid/contact.h"
 
 // Nodes in contact with free bodies: the impulses that they give by the velocities of the surfaces, and the
-// derivatives. The surfaces that a node meets do not depend on velocities, so they are found once in a step.
+// derivatives. The surfaces that a node meets do not depend on velocities, so they are found once in a step. Most nodes
+// meet one surface alone (`LoneNode`), and take few numbers and no calls; the others are `BodyNode`s.
 namespace mpm {
 inline namespace TORCH_MPM_ISA {
+
+// A node that meets the surface of one obstacle, within the walls.
+template <class T, int D>
+struct LoneNode {
+  int node, obstacle;      // row of the node tensors
+  Vector<int, D> lattice;  // its place
+  Vector<T, D> normal;     // unit, into the material
+  T mass;
+  Vector<T, D> velocity;  // before contact
+};
 
 template <class T, int D>
 struct BodyNode {
@@ -23,8 +34,72 @@ struct NodePush {
   int obstacle[D];
   Vector<double, D> at, position;  // [m]
   T impulse[D][D];                 // by face and axis [N s]
-  T slope[D][D][D][D];             // derivative of the impulse [face][axis] by the velocity of a surface [face][axis]
 };
+
+// Derivatives of the impulses [face][axis] of a node by the velocity of one of its faces along one axis.
+template <class T, int D>
+struct PushSlope {
+  T of[D][D];
+};
+
+template <class T, int D>
+MPM_HD Vector<double, D> as_double(const Vector<T, D>& v) {
+  Vector<double, D> r;
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    r[i] = double(v[i]);
+  return r;
+}
+
+template <class T, int D>
+MPM_HD Vector<double, D> place_of(const ContactArguments<T, D>& a, const Vector<int, D>& lattice) {
+  Vector<double, D> x;
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    x[i] = a.lower[i] + double(lattice[i] - kPadding) * a.dx;
+  return x;
+}
+
+// ---- nodes that meet one surface
+
+// Of a lone node at the present velocities of the obstacles.
+template <class T, int D>
+struct LoneContact {
+  const LoneNode<T, D>& node;
+  const ObstaclePose<T, D>& pose;
+  Vector<double, D> at, position;  // where impulses act, and where velocities are read [m]
+  Vector<T, D> u;                  // velocity relative to the surface
+
+  MPM_HD LoneContact(const ContactArguments<T, D>& a, const ObstaclePose<T, D>* poses, const LoneNode<T, D>& node)
+      : node(node), pose(poses[node.obstacle]), at(place_of(a, node.lattice)) {
+    Vector<T, D> x;
+    MPM_UNROLL for (int i = 0; i < D; i++)
+      x[i] = T(at[i]);
+    position = as_double(x);
+    u = node.velocity + T(-1) * velocity_at(pose, x);
+  }
+
+  MPM_HD Vector<T, D> change() const {
+    return contact_velocity(pose.contact, u, node.normal, pose.row->friction) + T(-1) * u;
+  }
+  MPM_HD Vector<double, D> impulse() const { return as_double((T(0) - node.mass) * change()); }
+
+  // Derivative of a component of the impulse by the velocity of the surface.
+  MPM_HD Vector<double, D> slope(int axis) const {
+    Vector<T, D> unit;
+    MPM_UNROLL for (int i = 0; i < D; i++)
+      unit[i] = T(i == axis);
+    const Vector<T, D> kept = contact_adjoint(pose.contact, u, node.normal, pose.row->friction, unit);
+    return as_double(node.mass * (kept + T(-1) * unit));
+  }
+};
+
+// A node that meets an obstacle alone, by its row and its place.
+template <class T, int D>
+MPM_HD LoneNode<T, D> lone_node(const ContactArguments<T, D>& a, const T* velocity, int64_t stride, int node,
+                                const Vector<int, D>& lattice, int obstacle, const Vector<T, D>& normal) {
+  return {node, obstacle, lattice, normal, a.mass[node * a.mass_stride], load_node<T, D>(velocity, stride, node)};
+}
+
+// ---- nodes that meet any surfaces
 
 // Sets the surfaces that a node meets. By all threads of a warp, as `any_of_warp`.
 template <class T, int D>
@@ -39,26 +114,22 @@ MPM_HD_CALL void set_body_node(bool wanted, const SlotPoses<T, D>& poses, const 
   find_constraints(poses, contact, result.met.constraints);
 }
 
-// Sets the velocities of the surfaces by the rows of their obstacles.
+// Whether a node has only what a `LoneNode` has.
 template <class T, int D>
-MPM_HD void set_surface_velocities(const ObstacleRow<T, D>* rows, BodyNode<T, D>& node) {
-  Constraints<T, D>& c = node.met.constraints;
-  MPM_LOOP for (int i = 0; i < c.count; i++) {
-    if (c.e[i].owner < 0) continue;
-    ObstaclePose<T, D> pose;
-    pose.row = rows + c.e[i].owner;
-    MPM_UNROLL for (int j = 0; j < D; j++)
-      pose.centre[j] = pose.row->position[j];
-    c.e[i].velocity = velocity_at(pose, node.position);
-  }
+MPM_HD bool is_lone(const ContactArguments<T, D>& a, const BodyNode<T, D>& node) {
+  bool lone = node.met.constraints.count == 1;
+  const Vector<double, D> at = place_of(a, node.lattice);
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    lone = lone && node.met.sign[i] == T(1) && node.position[i] == T(at[i]);
+  return lone;
 }
 
+// Sets the velocities of the surfaces by those of their obstacles.
 template <class T, int D>
-MPM_HD Vector<double, D> as_double(const Vector<T, D>& v) {
-  Vector<double, D> r;
-  MPM_UNROLL for (int i = 0; i < D; i++)
-    r[i] = double(v[i]);
-  return r;
+MPM_HD void set_surface_velocities(const ObstaclePose<T, D>* poses, BodyNode<T, D>& node) {
+  Constraints<T, D>& c = node.met.constraints;
+  MPM_LOOP for (int i = 0; i < c.count; i++)
+    if (c.e[i].owner >= 0) c.e[i].velocity = velocity_at(poses[c.e[i].owner], node.position);
 }
 
 // Sets the faces of obstacles that a node meets, and where it is.
@@ -69,45 +140,41 @@ MPM_HD void set_faces(const ContactArguments<T, D>& a, const BodyNode<T, D>& nod
   MPM_LOOP for (int i = 0; i < c.count; i++) {
     if (c.e[i].owner >= 0) push.obstacle[push.faces++] = c.e[i].owner;
   }
-  MPM_UNROLL for (int i = 0; i < D; i++)
-    push.at[i] = a.lower[i] + double(node.lattice[i] - kPadding) * a.dx;
+  push.at = place_of(a, node.lattice);
   push.position = as_double(node.position);
 }
 
-// Sets the impulses of a node with a mass and a velocity before contact.
+// The velocities that the surfaces take from a node.
 template <class T, int D>
-MPM_HD_CALL void set_impulses(bool wanted, const BodyNode<T, D>& node, const T& mass, const Vector<T, D>& v,
-                              NodePush<T, D>& push) {
-  if (!wanted) return;
-  const Constraints<T, D>& c = node.met.constraints;
-  TakenVelocities<T, D> taken;
-  take_velocities(c, node.met.sign, v, taken);
+MPM_HD_CALL void take_from_node(bool wanted, const BodyNode<T, D>& node, const Vector<T, D>& v,
+                                TakenVelocities<T, D>& taken) {
+  if (wanted) take_velocities(node.met.constraints, node.met.sign, v, taken);
+}
+
+// Sets the impulses of a node by its mass.
+template <class T, int D>
+MPM_HD void set_impulses(const BodyNode<T, D>& node, const T& mass, const TakenVelocities<T, D>& taken,
+                         NodePush<T, D>& push) {
   MPM_LOOP for (int i = 0; i < taken.count; i++) {
-    const bool is_wall = c.e[i].owner < 0;
+    const bool is_wall = node.met.constraints.e[i].owner < 0;
     T(&impulse)[D] = push.impulse[is_wall ? 0 : i];
     MPM_UNROLL for (int axis = 0; axis < D; axis++)
       impulse[axis] = (is_wall ? impulse[axis] : T(0)) + mass * taken.taken[i][axis];
   }
 }
 
-// Sets the derivatives of the impulses of a node that meets one surface, by the velocity of that.
+// The velocity v of a node after contact.
 template <class T, int D>
-MPM_HD void set_slopes_of_one(const BodyNode<T, D>& node, const T& mass, const Vector<T, D>& v, NodePush<T, D>& push) {
-  const Constraint<T, D>& only = node.met.constraints.e[0];
-  const Vector<T, D> u = reflected(node.met.sign, v) + T(-1) * only.velocity;
-  MPM_UNROLL for (int axis = 0; axis < D; axis++) {
-    Vector<T, D> unit = zero_vector<T, D>();
-    unit[axis] = T(1);
-    const Vector<T, D> kept = contact_adjoint(only.kind, u, only.normal, only.friction, unit);
-    MPM_UNROLL for (int by = 0; by < D; by++)
-      push.slope[0][axis][0][by] = mass * node.met.sign[axis] * (kept[by] - unit[by]);
-  }
+MPM_HD Vector<T, D> without(const TakenVelocities<T, D>& taken, Vector<T, D> v) {
+  MPM_LOOP for (int i = 0; i < taken.count; i++)
+    v = v + T(-1) * taken.taken[i];
+  return v;
 }
 
-// The same by the velocity of a face along an axis, for any number of surfaces, by dual numbers.
+// Sets the derivatives of the impulses of a node by the velocity of a face along an axis, by dual numbers.
 template <class T, int D>
 MPM_HD_CALL void set_slopes(bool wanted, const BodyNode<T, D>& node, const T& mass, const Vector<T, D>& v, int by_face,
-                            int by_axis, NodePush<T, D>& push) {
+                            int by_axis, PushSlope<T, D>& slope) {
   if (!wanted) return;
   using S = Dual<T>;
   const Constraints<T, D>& c = node.met.constraints;
@@ -124,49 +191,48 @@ MPM_HD_CALL void set_slopes(bool wanted, const BodyNode<T, D>& node, const T& ma
   MPM_LOOP for (int i = 0; i < c.count; i++) {
     const bool is_wall = c.e[i].owner < 0;
     MPM_UNROLL for (int axis = 0; axis < D; axis++) {
-      T& slope = push.slope[is_wall ? 0 : i][axis][by_face][by_axis];
-      slope = (is_wall ? slope : T(0)) - mass * node.met.sign[axis] * change[i][axis].derivative;
+      T& own = slope.of[is_wall ? 0 : i][axis];
+      own = (is_wall ? own : T(0)) - mass * node.met.sign[axis] * change[i][axis].derivative;
     }
   }
 }
 
-// Replaces the velocity of a node by that after contact.
-template <class T, int D>
-MPM_HD_CALL void change_velocity(bool wanted, const BodyNode<T, D>& node, Vector<T, D>& v) {
-  if (wanted) v = node.met.after(v);
-}
-
 // ---- sums over nodes: impulses on the motions of bodies, and their derivatives
 
-template <class T, int D>
+template <int D>
 MPM_HD Vector<double, D> arm_from(const BodyNow<D>& b, const Vector<double, D>& x) {
   return x + -1.0 * b.position;
 }
 
-// The impulse of a face along motion number i of the body that owns it.
-template <class T, int D>
-MPM_HD double impulse_along(const NodePush<T, D>& push, int face, const BodyNow<D>& b, int i) {
-  const Vector<double, D> way = unit_motion(i, arm_from<T>(b, push.at));
-  double sum = 0;
-  MPM_UNROLL for (int axis = 0; axis < D; axis++)
-    sum += way[axis] * double(push.impulse[face][axis]);
-  return sum;
+// Derivative of an impulse at arm `at` along the motions i of a body, by the motions j of a body at arm `by`, as number
+// i n + j; `slope(axis)` is that of a component by the velocity there.
+template <int D, class Slope>
+MPM_HD void set_slope_block(const Slope& slope, const Vector<double, D>& at, const Vector<double, D>& by,
+                            double (&block)[kMotions<D> * kMotions<D>]) {
+  constexpr int n = kMotions<D>;
+  double rows[D][n];
+  MPM_LOOP for (int axis = 0; axis < D; axis++)
+    set_along_motions(by, slope(axis), rows[axis]);
+  MPM_UNROLL for (int j = 0; j < n; j++) {
+    Vector<double, D> column;
+    double along[n];
+    MPM_UNROLL for (int axis = 0; axis < D; axis++)
+      column[axis] = rows[axis][j];
+    set_along_motions(at, column, along);
+    MPM_UNROLL for (int i = 0; i < n; i++)
+      block[i * n + j] = along[i];
+  }
 }
 
-// Derivative of the impulse of a face [D] by motion number j of the body that owns face `by_face`.
+// Of one face of a node, by the velocity of another one along an axis, for `set_slope_block`.
 template <class T, int D>
-MPM_HD Vector<double, D> impulse_slope(const NodePush<T, D>& push, int face, int by_face, const BodyNow<D>& by, int j) {
-  const Vector<double, D> velocity = unit_motion(j, arm_from<T>(by, push.position));
-  Vector<double, D> slope = zero_vector<double, D>();
-  MPM_UNROLL for (int p = 0; p < D; p++) MPM_UNROLL
-    for (int q = 0; q < D; q++) slope[p] += double(push.slope[face][p][by_face][q]) * velocity[q];
-  return slope;
-}
-
-// The same along motion number i of the body that owns the face.
-template <class T, int D>
-MPM_HD double slope_along(const NodePush<T, D>& push, const Vector<double, D>& slope, const BodyNow<D>& b, int i) {
-  return dot(unit_motion(i, arm_from<T>(b, push.at)), slope);
+MPM_HD auto slope_by_axis(const PushSlope<T, D>& slope, int face, int by_axis) {
+  return [&slope, face, by_axis](int axis) {
+    Vector<double, D> row;
+    MPM_UNROLL for (int i = 0; i < D; i++)
+      row[i] = i == by_axis ? double(slope.of[face][axis]) : 0;
+    return row;
+  };
 }
 
 }  // namespace TORCH_MPM_ISA

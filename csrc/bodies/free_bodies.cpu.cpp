@@ -1,8 +1,10 @@
 #include "bodies/free_bodies.h"
 
 #include <algorithm>
+#include <optional>
 #include <vector>
 
+#include "bodies/near_parts.h"
 #include "cpu/parallel.h"
 
 namespace mpm::cpu {
@@ -11,13 +13,23 @@ namespace {
 
 constexpr int64_t kGrain = 64;  // slots below which a range is not split
 
+template <class T, int D>
+struct SceneNodes {
+  std::vector<LoneNode<T, D>> lone;
+  std::vector<BodyNode<T, D>> others;
+
+  void add(const SceneNodes& n) {
+    lone.insert(lone.end(), n.lone.begin(), n.lone.end());
+    others.insert(others.end(), n.others.begin(), n.others.end());
+  }
+};
+
 // One thread for all of a scene.
 template <class T, int D>
 struct OneThread {
   static constexpr int n = kMotions<D>;
   const FreeBodiesArguments<T, D>& a;
-  // Of the scene, in the order of the slots; each pass sets the velocities of their surfaces.
-  mutable std::vector<BodyNode<T, D>> nodes;
+  SceneNodes<T, D> nodes;  // in the order of the slots
 
   template <class F>
   void each(int count, const F& f) const {
@@ -25,80 +37,137 @@ struct OneThread {
   }
   void sync() const {}
 
-  template <class Visit>
-  void each_node(const ObstacleRow<T, D>* rows, const Visit& visit) const {
-    for (BodyNode<T, D>& node : nodes) {
-      set_surface_velocities(rows, node);
-      visit(node, a.contact.mass[node.node * a.contact.mass_stride], load_node<T, D>(a.velocity, a.stride, node.node));
-    }
-  }
-
   template <class Scene>
-  void add_up_impulses(const Scene& scene, double* sums) const {
-    std::fill_n(sums, a.bodies * n, 0.0);
-    each_node(scene.rows, [&](const BodyNode<T, D>& node, const T& mass, const Vector<T, D>& v) {
-      NodePush<T, D> push;
-      set_faces(a.contact, node, push);
-      set_impulses(true, node, mass, v, push);
-      for (int face = 0; face < push.faces; face++) {
-        const int k = a.owner[push.obstacle[face]];
-        MPM_UNROLL for (int i = 0; i < n; i++)
-          sums[k * n + i] += impulse_along(push, face, scene.now[k], i);
-      }
-    });
-  }
-
-  template <class Scene>
-  void add_up_slopes(const Scene& scene, double* sums) const {
+  void add_up(const Scene& scene, double* impulses, double* slopes) const {
     const int m = a.bodies * n;
-    std::fill_n(sums, m * m, 0.0);
-    each_node(scene.rows, [&](const BodyNode<T, D>& node, const T& mass, const Vector<T, D>& v) {
+    if (impulses) std::fill_n(impulses, m, 0.0);
+    if (slopes) std::fill_n(slopes, m * m, 0.0);
+    for (const LoneNode<T, D>& node : nodes.lone) {
+      const LoneContact<T, D> contact(a.contact, scene.poses, node);
+      const int k = a.owner[node.obstacle];
+      const auto at = arm_from(scene.now[k], contact.at);
+      if (impulses) add_impulse(at, contact.impulse(), impulses + k * n);
+      if (slopes)
+        add_slopes([&](int axis) { return contact.slope(axis); }, at, arm_from(scene.now[k], contact.position), k, k,
+                   slopes);
+    }
+    each_other(scene, [&](const BodyNode<T, D>& node, const T& mass, const Vector<T, D>& v) {
       NodePush<T, D> push;
       set_faces(a.contact, node, push);
-      const bool one = node.met.constraints.count == 1;
-      if (one) set_slopes_of_one(node, mass, v, push);
-      for (int by = 0; by < push.faces; by++) {
-        for (int axis = 0; axis < D && !one; axis++) set_slopes(true, node, mass, v, by, axis, push);
-        for (int face = 0; face < push.faces; face++)
-          add_slopes(push, face, by, a.owner[push.obstacle[face]], a.owner[push.obstacle[by]], scene.now, sums, m);
-      }
+      if (impulses) add_impulses(scene, node, mass, v, push, impulses);
+      for (int by = 0; slopes && by < push.faces; by++)
+        for (int axis = 0; axis < D; axis++) add_slopes_by(scene, node, mass, v, push, by, axis, slopes);
     });
-  }
-
-  // Derivatives of the impulse of a face of body k by the motion of body l, which owns the face `by`.
-  static void add_slopes(const NodePush<T, D>& push, int face, int by, int k, int l, const BodyNow<D>* now,
-                         double* sums, int m) {
-    MPM_UNROLL for (int j = 0; j < n; j++) {
-      const Vector<double, D> slope = impulse_slope(push, face, by, now[l], j);
-      MPM_UNROLL for (int i = 0; i < n; i++)
-        sums[(k * n + i) * m + l * n + j] += slope_along(push, slope, now[k], i);
-    }
   }
 
   template <class Scene>
   void change_nodes(const Scene& scene) const {
-    each_node(scene.rows, [&](const BodyNode<T, D>& node, const T&, Vector<T, D> v) {
-      change_velocity(true, node, v);
+    for (const LoneNode<T, D>& node : nodes.lone) {
+      const Vector<T, D> v = node.velocity + LoneContact<T, D>(a.contact, scene.poses, node).change();
       std::copy_n(v.e, D, a.velocity + node.node * a.stride);
+    }
+    each_other(scene, [&](const BodyNode<T, D>& node, const T&, const Vector<T, D>& v) {
+      TakenVelocities<T, D> taken;
+      take_from_node(true, node, v, taken);
+      std::copy_n(without(taken, v).e, D, a.velocity + node.node * a.stride);
     });
+  }
+
+ private:
+  template <class Scene, class Visit>
+  void each_other(const Scene& scene, const Visit& visit) const {
+    for (BodyNode<T, D> node : nodes.others) {
+      set_surface_velocities(scene.poses, node);
+      visit(node, a.contact.mass[node.node * a.contact.mass_stride], load_node<T, D>(a.velocity, a.stride, node.node));
+    }
+  }
+
+  static void add_impulse(const Vector<double, D>& arm, const Vector<double, D>& impulse, double* sums) {
+    double along[n];
+    set_along_motions(arm, impulse, along);
+    MPM_UNROLL for (int i = 0; i < n; i++)
+      sums[i] += along[i];
+  }
+
+  template <class Scene>
+  void add_impulses(const Scene& scene, const BodyNode<T, D>& node, const T& mass, const Vector<T, D>& v,
+                    NodePush<T, D>& push, double* sums) const {
+    TakenVelocities<T, D> taken;
+    take_from_node(true, node, v, taken);
+    set_impulses(node, mass, taken, push);
+    for (int face = 0; face < push.faces; face++) {
+      const int k = a.owner[push.obstacle[face]];
+      Vector<double, D> impulse;
+      std::copy_n(push.impulse[face], D, impulse.e);
+      add_impulse(arm_from(scene.now[k], push.at), impulse, sums + k * n);
+    }
+  }
+
+  // Derivatives of the impulses on all faces by the velocity of one along an axis.
+  template <class Scene>
+  void add_slopes_by(const Scene& scene, const BodyNode<T, D>& node, const T& mass, const Vector<T, D>& v,
+                     const NodePush<T, D>& push, int by, int axis, double* sums) const {
+    PushSlope<T, D> slope;
+    set_slopes(true, node, mass, v, by, axis, slope);
+    const int l = a.owner[push.obstacle[by]];
+    for (int face = 0; face < push.faces; face++) {
+      const int k = a.owner[push.obstacle[face]];
+      add_slopes(slope_by_axis(slope, face, axis), arm_from(scene.now[k], push.at),
+                 arm_from(scene.now[l], push.position), k, l, sums);
+    }
+  }
+
+  template <class Slope>
+  void add_slopes(const Slope& slope, const Vector<double, D>& at, const Vector<double, D>& by, int k, int l,
+                  double* sums) const {
+    const int m = a.bodies * n;
+    double block[n * n];
+    set_slope_block(slope, at, by, block);
+    MPM_UNROLL for (int i = 0; i < n; i++) MPM_UNROLL
+      for (int j = 0; j < n; j++) sums[(k * n + i) * m + l * n + j] += block[i * n + j];
   }
 };
 
-// Finds the nodes of a slot that are in contact.
+// Adds a node of a slot that may meet several surfaces.
 template <class T, int D>
-void find_nodes(const FreeBodiesArguments<T, D>& a, int slot, std::vector<BodyNode<T, D>>& nodes) {
+void add_node(const FreeBodiesArguments<T, D>& a, const SlotPoses<T, D>& poses, int slot, int local,
+              SceneNodes<T, D>& nodes) {
+  NodeContact<T, D> contact;
+  find_surfaces(true, poses, node_position(a.contact, poses.s.corner, local), contact);
+  if (contact.count == 0) return;
+  BodyNode<T, D> node;
+  set_body_node(true, poses, contact, slot * kBlockNodes<D> + local, local, node);
+  if (is_lone(a.contact, node))
+    nodes.lone.push_back(lone_node(a.contact, a.velocity, a.stride, node.node, node.lattice,
+                                   node.met.constraints.e[0].owner, node.met.constraints.e[0].normal));
+  else
+    nodes.others.push_back(node);
+}
+
+// Finds the nodes of a slot that are in contact. `placed` has the rows of the obstacles as they are in this step.
+template <class T, int D>
+void find_nodes(const FreeBodiesArguments<T, D>& a, const ContactArguments<T, D>& placed,
+                const ObstaclePose<T, D>* poses, int slot, SceneNodes<T, D>& nodes) {
   const int first = slot * kBlockNodes<D>;
   bool any = false;
   for (int local = 0; local < kBlockNodes<D>; local++) any |= has_mass(a.contact, first + local);
   if (!any) return;
-  const SlotPoses<T, D> poses(a.contact, slot);
-  for (int local = 0; local < kBlockNodes<D> && poses.s.near; local++) {
+  int corner[D];
+  const int block = a.contact.block[slot], scene = block_coordinates(a.contact.geometry, block, corner);
+  if (block < 0 || scene >= a.scenes) return;
+  for (int& i : corner) i *= kBlockWidth;
+  poses += int64_t(scene) * a.contact.obstacles;
+  const NearParts parts = near_parts(a.contact, poses, corner);
+  std::optional<SlotPoses<T, D>> of_slot;
+  for (int local = 0; local < kBlockNodes<D> && parts.near; local++) {
     if (!has_mass(a.contact, first + local)) continue;
-    NodeContact<T, D> contact;
-    find_contact(true, poses, node_position(a.contact, poses.s.corner, local), contact);
-    if (contact.count == 0) continue;
-    nodes.emplace_back();
-    set_body_node(true, poses, contact, first + local, local, nodes.back());
+    const NodeTouch<T, D> touch = touch_of_parts(a.contact, poses, parts, node_position(a.contact, corner, local));
+    if (touch.obstacle >= 0)
+      nodes.lone.push_back(lone_node(a.contact, a.velocity, a.stride, first + local, lattice_node<D>(corner, local),
+                                     touch.obstacle, touch.normal));
+    if (touch.obstacle != touch.several) continue;
+    if (!of_slot) of_slot.emplace(placed, slot);
+    add_node(a, *of_slot, slot, local, nodes);
   }
 }
 
@@ -112,31 +181,40 @@ int64_t free_bodies_workspace(const FreeBodiesArguments<T, D>&) {
 
 template <class T, int D>
 void free_bodies(const FreeBodiesArguments<T, D>& a) {
-  const int m = a.bodies * kMotions<D>, scenes = a.scenes;
-  const int64_t numbers = SceneNumbers::count(a.bodies, m);
-  std::vector<BodyNow<D>> now(size_t(scenes) * size_t(a.bodies));
+  using Team = OneThread<T, D>;
+  using Bodies = SceneBodies<T, D, Team>;
+  const int64_t scenes = a.scenes, obstacles = a.contact.obstacles;
+  const int64_t numbers = SceneNumbers::count(a.bodies, a.bodies * kMotions<D>);
+  std::vector<BodyNow<D>> now(size_t(scenes * a.bodies));
+  std::vector<ObstacleRow<T, D>> rows(size_t(scenes * obstacles));
+  std::vector<ObstaclePose<T, D>> poses(rows.size());
   std::vector<double> memory(size_t(scenes * numbers));
-  std::vector<OneThread<T, D>> teams(size_t(scenes), OneThread<T, D>{a, {}});
-  const auto scene_of = [&](int64_t scene) {
-    return SceneBodies<T, D, OneThread<T, D>>(a, int(scene), now.data() + scene * a.bodies,
-                                              memory.data() + scene * numbers, teams[size_t(scene)]);
+  std::vector<Team> teams(size_t(scenes), Team{a, {}});
+  const auto memory_of = [&](int64_t scene) {
+    return SceneMemory<T, D>{now.data() + scene * a.bodies, rows.data() + scene * obstacles,
+                             poses.data() + scene * obstacles, memory.data() + scene * numbers};
   };
   parallel_ranges(scenes, 1, [&](int64_t begin, int64_t end) {
-    for (int64_t scene = begin; scene < end; scene++) scene_of(scene).begin();
+    for (int64_t scene = begin; scene < end; scene++)
+      Bodies::begin(a, int(scene), memory_of(scene), teams[size_t(scene)]);
   });
+  ContactArguments<T, D> placed = a.contact;
+  placed.row = rows.data();
+  placed.rows = a.scenes;
   const int slots = a.contact.max_blocks;
-  std::vector<std::vector<BodyNode<T, D>>> of_slot{size_t(slots)};
+  std::vector<SceneNodes<T, D>> of_slot{size_t(slots)};
   parallel_ranges(slots, kGrain, [&](int64_t begin, int64_t end) {
-    for (int64_t slot = begin; slot < end; slot++) find_nodes(a, int(slot), of_slot[size_t(slot)]);
+    for (int64_t slot = begin; slot < end; slot++)
+      find_nodes(a, placed, poses.data(), int(slot), of_slot[size_t(slot)]);
   });
   for (int slot = 0; slot < slots; slot++) {
-    const auto& found = of_slot[size_t(slot)];
-    if (found.empty()) continue;
-    auto& nodes = teams[size_t(a.contact.block[slot] / a.contact.geometry.blocks_per_scene)].nodes;
-    nodes.insert(nodes.end(), found.begin(), found.end());
+    const SceneNodes<T, D>& found = of_slot[size_t(slot)];
+    if (found.lone.empty() && found.others.empty()) continue;
+    teams[size_t(a.contact.block[slot] / a.contact.geometry.blocks_per_scene)].nodes.add(found);
   }
   parallel_ranges(scenes, 1, [&](int64_t begin, int64_t end) {
-    for (int64_t scene = begin; scene < end; scene++) scene_of(scene).solve();
+    for (int64_t scene = begin; scene < end; scene++)
+      Bodies(a, int(scene), memory_of(scene), teams[size_t(scene)]).solve();
   });
 }
 

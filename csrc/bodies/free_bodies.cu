@@ -1,62 +1,29 @@
 #include "bodies/free_bodies.h"
-#include "cuda/launch.cuh"
+
+#include "bodies/near_parts.h"
+#include "bodies/warp_sums.cuh"
+#include "cuda/programmatic_launch.cuh"
 
 // A thread block per scene computes the step of its bodies: it lists the nodes in contact in the order of the slots,
-// stores what they meet, and runs all iterations of Newton's method. Sums have a fixed order.
+// stores what they meet, and runs all iterations of Newton's method. What does not depend on the nodes, the poses and
+// the slots near them, is computed while the previous kernel ends. Sums have a fixed order.
 namespace mpm::cuda {
 namespace {
 
-// Threads of a block: few for many scenes, so that their latencies overlap.
-constexpr int kFewThreads = 128, kManyThreads = 512, kManyScenes = 256;
+// Threads of a block: a warp for each of many scenes, so that all run at once; and more where a scene is alone or
+// large.
+constexpr int kFewThreads = 32, kSomeThreads = 128, kManyThreads = 512;
+constexpr int kManyScenes = 256, kManySlots = 256;  // the slots of a scene on average
 // Nodes per slot, on average over a scene, whose surfaces are stored; those of others are found in every pass.
 constexpr int kRoom = 8;
-// Nodes whose impulses are in shared memory at a time, whole warps.
-template <class T>
-constexpr int kTile = sizeof(T) == 4 ? 64 : 32;
-constexpr int64_t kMostShared = 1 << 15;  // bytes of a scene's bodies and numbers that may be there, too
+template <int D>
+constexpr int kLoneRoom = D == 2 ? 8 : 16;  // the same of nodes that meet one surface
+constexpr int64_t kMostShared = 1 << 15;    // bytes of a scene's bodies and numbers, and of its sums, in shared memory
 
-struct NearObstacles {
-  uint64_t near, touching;  // see ContactSlot
-};
-
-// The work space in global memory.
-template <class T, int D>
-struct BodiesMemory {
-  NearObstacles* near;    // [slots]
-  int* list;              // [slots * kBlockNodes] nodes of a scene: first those that have mass near bodies
-  BodyNode<T, D>* nodes;  // [slots * kRoom]
-  BodyNow<D>* now;        // [scenes, bodies], where shared memory has no room for these and the numbers
-  double* numbers;
-  bool shares;  // whether it has
-  int64_t bytes;
-
-  BodiesMemory(const FreeBodiesArguments<T, D>& a, char* memory) {
-    int64_t at = 0;
-    const auto take = [&](int64_t size) {
-      char* const p = memory + at;
-      at += (size + 255) / 256 * 256;
-      return p;
-    };
-    const int64_t slots = a.contact.max_blocks, of_scene = bytes_of_scene(a);
-    shares = of_scene <= kMostShared;
-    near = reinterpret_cast<NearObstacles*>(take(slots * int64_t(sizeof(NearObstacles))));
-    list = reinterpret_cast<int*>(take(slots * kBlockNodes<D> * int64_t(sizeof(int))));
-    nodes = reinterpret_cast<BodyNode<T, D>*>(take(slots * kRoom * int64_t(sizeof(BodyNode<T, D>))));
-    now = reinterpret_cast<BodyNow<D>*>(take(shares ? 0 : a.scenes * int64_t(a.bodies) * int64_t(sizeof(BodyNow<D>))));
-    numbers = reinterpret_cast<double*>(take(shares ? 0 : a.scenes * numbers_of_scene(a) * int64_t(sizeof(double))));
-    bytes = at;
-  }
-
-  __host__ __device__ static int64_t numbers_of_scene(const FreeBodiesArguments<T, D>& a) {
-    return SceneNumbers::count(a.bodies, a.bodies * kMotions<D>);
-  }
-  static int64_t bytes_of_scene(const FreeBodiesArguments<T, D>& a) {
-    return a.bodies * int64_t(sizeof(BodyNow<D>)) + numbers_of_scene(a) * int64_t(sizeof(double));
-  }
-  int64_t shared_bytes(const FreeBodiesArguments<T, D>& a, int threads) const {
-    return int64_t(sizeof(double)) * threads + kTile<T> * int64_t(sizeof(NodePush<T, D>)) +
-           (shares ? bytes_of_scene(a) : 0);
-  }
+template <int D>
+struct NearSlot {
+  int slot, corner[D];
+  NearParts parts;
 };
 
 // The slots of a scene, first those with particles and then those of the margin.
@@ -69,95 +36,141 @@ struct SceneSlots {
   __device__ int64_t before() const { return int64_t(begin) + (margin_begin - first_slots); }
 };
 
-// First slot from `begin` on with block `least` or a later one, or unused.
-__device__ int first_slot_from(const int* block, int begin, int end, int64_t least) {
-  while (begin < end) {
-    const int middle = begin + (end - begin) / 2;
-    if (block[middle] >= 0 && block[middle] < least)
-      begin = middle + 1;
-    else
-      end = middle;
-  }
-  return begin;
+// Threads of a block.
+template <class T, int D>
+int threads_of(const FreeBodiesArguments<T, D>& a) {
+  if (a.contact.max_blocks / a.scenes > kManySlots) return a.scenes < kManyScenes ? kManyThreads : kSomeThreads;
+  return a.scenes < kManyScenes ? kSomeThreads : kFewThreads;
 }
 
+// The work space in global memory. A scene has its part of each array.
+template <class T, int D>
+struct BodiesMemory {
+  NearSlot<D>* near;      // [slots]
+  int* list;              // [slots * kBlockNodes] nodes of a scene as `node_of` has them
+  BodyNode<T, D>* nodes;  // [slots * kRoom]
+  LoneNode<T, D>* lone;   // [slots * kLoneRoom + scenes * threads]
+  BodyNow<D>* now;        // [scenes, bodies], where shared memory has no room for these and the numbers
+  double* numbers;
+  bool shares;  // whether it has
+  int adders;   // warps that add up, each with sums of its own
+  int64_t bytes;
+
+  BodiesMemory(const FreeBodiesArguments<T, D>& a, char* memory) {
+    int64_t at = 0;
+    const auto take = [&](auto*& pointer, int64_t count) {
+      pointer = reinterpret_cast<std::remove_reference_t<decltype(pointer)>>(memory + at);
+      at += (count * int64_t(sizeof(*pointer)) + 255) / 256 * 256;
+    };
+    const int64_t slots = a.contact.max_blocks;
+    const int threads = threads_of(a);
+    shares = bytes_of_scene(a) <= kMostShared;
+    adders = int(std::clamp<int64_t>(kMostShared / (sums_of_scene(a) * int64_t(sizeof(double))), 1, threads / 32));
+    take(near, slots);
+    take(list, slots * kBlockNodes<D>);
+    take(nodes, slots * kRoom);
+    take(lone, slots * kLoneRoom<D> + int64_t(a.scenes) * threads);
+    take(now, shares ? 0 : a.scenes * int64_t(a.bodies));
+    take(numbers, shares ? 0 : a.scenes * numbers_of_scene(a));
+    bytes = at;
+  }
+
+  __host__ __device__ static int64_t numbers_of_scene(const FreeBodiesArguments<T, D>& a) {
+    return SceneNumbers::count(a.bodies, a.bodies * kMotions<D>);
+  }
+  static int64_t bytes_of_scene(const FreeBodiesArguments<T, D>& a) {
+    return a.bodies * int64_t(sizeof(BodyNow<D>)) + numbers_of_scene(a) * int64_t(sizeof(double));
+  }
+  // Impulses and slopes.
+  __host__ __device__ static int64_t sums_of_scene(const FreeBodiesArguments<T, D>& a) {
+    const int64_t m = a.bodies * kMotions<D>;
+    return m * (m + 1);
+  }
+  int64_t shared_bytes(const FreeBodiesArguments<T, D>& a) const {
+    return (adders > 1 ? adders * sums_of_scene(a) * int64_t(sizeof(double)) : 0) + (shares ? bytes_of_scene(a) : 0) +
+           a.contact.obstacles * int64_t(sizeof(ObstaclePose<T, D>) + sizeof(ObstacleRow<T, D>));
+  }
+
+  // Of a scene; sets the sums of the adders in shared memory.
+  __device__ SceneMemory<T, D> of_scene(const FreeBodiesArguments<T, D>& a, int scene, double* shared,
+                                        double*& sums) const {
+    SceneMemory<T, D> m;
+    sums = shared;
+    if (adders > 1) shared += adders * sums_of_scene(a);
+    m.numbers = shares ? shared : numbers + scene * numbers_of_scene(a);
+    if (shares) shared += numbers_of_scene(a);
+    m.now = shares ? reinterpret_cast<BodyNow<D>*>(shared) : now + int64_t(scene) * a.bodies;
+    if (shares) shared = reinterpret_cast<double*>(m.now + a.bodies);
+    m.poses = reinterpret_cast<ObstaclePose<T, D>*>(shared);
+    m.rows = reinterpret_cast<ObstacleRow<T, D>*>(m.poses + a.contact.obstacles);
+    return m;
+  }
+};
+
+// Four searches at once in the blocks of the slots, which are in order, by eight lanes each. By all threads of a warp.
 template <class T, int D>
 __device__ SceneSlots slots_of_scene(const FreeBodiesArguments<T, D>& a, int scene) {
-  const ContactArguments<T, D>& c = a.contact;
-  const int64_t first = int64_t(scene) * c.geometry.blocks_per_scene, next = first + c.geometry.blocks_per_scene;
-  SceneSlots s;
-  s.first_slots = a.first_slots;
-  s.begin = first_slot_from(c.block, 0, a.first_slots, first);
-  s.count = first_slot_from(c.block, s.begin, a.first_slots, next) - s.begin;
-  s.margin_begin = first_slot_from(c.block, a.first_slots, c.max_blocks, first);
-  s.margin_count = first_slot_from(c.block, s.margin_begin, c.max_blocks, next) - s.margin_begin;
-  return s;
-}
-
-// The slot of a node with what the kernel has stored of it; an inactive one where it is not wanted.
-template <class T, int D>
-__device__ ContactSlot<T, D> stored_slot(bool wanted, const ContactArguments<T, D>& a, const NearObstacles* near,
-                                         int node) {
-  ContactSlot<T, D> s;
-  if (!wanted) return s;
-  const int slot = node / kBlockNodes<D>;
-  s.scene = block_coordinates(a.geometry, a.block[slot], s.corner);
-#pragma unroll
-  for (int i = 0; i < D; i++) s.corner[i] *= kBlockWidth;
-  s.active = true;
-  s.walled = is_walled(a, s.corner);
-  s.near = near[slot].near;
-  s.touching = near[slot].touching;
-  s.row = rows_of_scene(a, s.scene);
-  return s;
-}
-
-// The surfaces of a node that the kernel has not stored. By all threads of a warp, as `any_of_warp`.
-template <class T, int D>
-__device__ __noinline__ void search_node(bool wanted, const ContactArguments<T, D>& a, const NearObstacles* near,
-                                         int node, BodyNode<T, D>& result) {
-  const SlotPoses<T, D> poses(a, stored_slot(wanted, a, near, node));
-  const int local = node % kBlockNodes<D>;
-  NodeContact<T, D> contact;
-  find_contact(wanted, poses, node_position(a, poses.s.corner, local), contact);
-  if (any_of_warp(wanted)) {
-    set_body_node(wanted, poses, contact, node, local, result);
-    join_warp();
+  constexpr int lanes = 8;
+  const int lane = int(threadIdx.x) % 32, search = lane / lanes, part = lane % lanes;
+  // The first slot with this block or a later one, or unused.
+  const int64_t least = int64_t(scene + search % 2) * a.contact.geometry.blocks_per_scene;
+  int begin = search < 2 ? 0 : a.first_slots, end = search < 2 ? a.first_slots : a.contact.max_blocks;
+  while (any_of_warp(begin < end)) {
+    const int step = (end - begin + lanes - 1) / lanes, at = begin + part * step;
+    const int block = at < end ? a.contact.block[at] : -1;
+    const unsigned flags = __ballot_sync(~0u, block >= 0 && block < least) >> (lane - part);
+    const int before = __popc(flags & ((1u << lanes) - 1));
+    end = before ? min(begin + before * step, end) : begin;
+    if (before) begin += (before - 1) * step + 1;
   }
+  int found[4];
+#pragma unroll
+  for (int i = 0; i < 4; i++) found[i] = __shfl_sync(~0u, begin, i * lanes);
+  return {found[0], found[1] - found[0], found[2], found[3] - found[2], a.first_slots};
 }
 
 // The threads of a block with the nodes of their scene, as SceneBodies has it.
 template <int kThreads, class T, int D>
 struct BlockTeam {
   const FreeBodiesArguments<T, D>& a;
-  const NearObstacles* near;
-  int* list;              // of the scene
-  BodyNode<T, D>* nodes;  // of the scene
-  int room;               // of `nodes`
-  NodePush<T, D>* push;   // [kTile] in shared memory
-  double* partial;        // [kThreads] in shared memory
-  int* of_warps;          // [kWarps] in shared memory
-  int count = 0;          // of nodes in contact
+  const int scene;
+  const SceneMemory<T, D>& memory;
+  // Of the scene, as BodiesMemory has them.
+  NearSlot<D>* near;
+  int* list;
+  BodyNode<T, D>* nodes;
+  LoneNode<T, D>* lone;
+  int room, lone_room;  // numbers of nodes that these have room for
+  int adders;
+  double* sums;                                   // [adders, m + m²] in shared memory
+  int* of_warps;                                  // [kWarps] in shared memory
+  int near_count = 0, count = 0, lone_count = 0;  // of slots, and of nodes in contact
+  bool overflows = false;                         // whether there was no room for lone nodes
 
   static constexpr int n = kMotions<D>, kWarps = kThreads / 32;
-  static_assert(kThreads % kTile<T> == 0);
 
   template <class F>
   __device__ void each(int items, const F& f) const {
+#pragma unroll 1
     for (int i = threadIdx.x; i < items; i += kThreads) f(i);
   }
-  __device__ void sync() const { __syncthreads(); }
+  __device__ static void sync() { kWarps == 1 ? __syncwarp() : __syncthreads(); }
+  __device__ static int lane() { return int(threadIdx.x) % 32; }
 
-  // ---- the list of nodes
+  // ---- lists
 
   // The place of the flags of this thread among those of the block, in the order of threads; adds them to `total`.
   __device__ int place(bool flag, int& total) const {
     const unsigned flags = __ballot_sync(~0u, flag);
-    const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
-    if (lane == 0) of_warps[warp] = __popc(flags);
+    int before = total + __popc(flags & ((1u << lane()) - 1));
+    if constexpr (kWarps == 1) {
+      total += __popc(flags);
+      return before;
+    }
+    const int warp = int(threadIdx.x) / 32;
+    if (lane() == 0) of_warps[warp] = __popc(flags);
     __syncthreads();
-    int before = total + __popc(flags & ((1u << lane) - 1));
-    for (int w = 0; w < kWarps; w++) {
+    MPM_LOOP for (int w = 0; w < kWarps; w++) {
       if (w < warp) before += of_warps[w];
       total += of_warps[w];
     }
@@ -165,214 +178,360 @@ struct BlockTeam {
     return before;
   }
 
-  // Lists the nodes in contact, and stores the surfaces of as many as there is room for.
-  __device__ void find_nodes(const SceneSlots& slots, NearObstacles* to) {
-    each(slots.total(), [&](int i) {
-      const ContactSlot<T, D> s = contact_slot(a.contact, slots[i]);
-      to[slots[i]] = {s.near, s.touching};
-    });
-    __syncthreads();
-    int candidates = 0;
-    const int all = slots.total() * kBlockNodes<D>;
+  // Lists the slots near parts.
+  __device__ void find_slots(const SceneSlots& slots) {
+    const int all = slots.total();
     for (int first = 0; first < all; first += kThreads) {
       const int i = first + int(threadIdx.x);
-      const int slot = i < all ? slots[i / kBlockNodes<D>] : 0, node = slot * kBlockNodes<D> + i % kBlockNodes<D>;
-      const bool wanted = i < all && near[slot].near && has_mass(a.contact, node);
-      const int at = place(wanted, candidates);
-      if (wanted) list[at] = node;
+      NearSlot<D> found;
+      if (i < all) {
+        found.slot = slots[i];
+        block_coordinates(a.contact.geometry, a.contact.block[found.slot], found.corner);
+#pragma unroll
+        for (int k = 0; k < D; k++) found.corner[k] *= kBlockWidth;
+        found.parts = near_parts(a.contact, memory.poses, found.corner);
+      }
+      const bool is_near = i < all && found.parts.near;
+      const int at = place(is_near, near_count);
+      if (is_near) near[at] = found;
     }
-    __syncthreads();
-    for (int first = 0; first < candidates; first += kThreads) keep_if_in_contact(first, candidates);
-    __syncthreads();
+    sync();
   }
 
-  // Keeps the candidates from number `first` on that are in contact, by all threads of the block.
-  __device__ void keep_if_in_contact(int first, int candidates) {
+  // A node of the list: number of a near slot times kBlockNodes, and number in the block.
+  __device__ const NearSlot<D>& slot_of(int entry) const { return near[entry / kBlockNodes<D>]; }
+  __device__ static int local_of(int entry) { return entry % kBlockNodes<D>; }
+  __device__ int node_of(int entry) const { return slot_of(entry).slot * kBlockNodes<D> + local_of(entry); }
+
+  // Lists the nodes in contact, and stores what they meet, as far as there is room.
+  __device__ void find_nodes() {
+    int candidates = 0, several = 0;
+    list_nodes_with_mass(candidates);
+    for (int first = 0; first < candidates; first += kThreads) find_touch(first, candidates, several);
+    sync();
+    for (int first = 0; first < several; first += kThreads) find_surfaces_of(first, several);
+    sync();
+  }
+
+  __device__ void list_nodes_with_mass(int& candidates) {
+    constexpr int ahead = 4;  // loads of a thread at a time
+    const int all = near_count * kBlockNodes<D>;
+    for (int first = 0; first < all; first += ahead * kThreads) {
+      bool wanted[ahead];
+#pragma unroll
+      for (int k = 0; k < ahead; k++) {
+        const int entry = first + k * kThreads + int(threadIdx.x);
+        wanted[k] = entry < all && has_mass(a.contact, node_of(entry));
+      }
+#pragma unroll
+      for (int k = 0; k < ahead; k++) {
+        if (first + k * kThreads >= all) break;
+        const int at = place(wanted[k], candidates);
+        if (wanted[k]) list[at] = first + k * kThreads + int(threadIdx.x);
+      }
+    }
+    sync();
+  }
+
+  // Stores candidates from number `first` on that meet one surface, and keeps those in the list that may meet several.
+  // By all threads of the block, as the next function.
+  __device__ void find_touch(int first, int candidates, int& several) {
     const int i = first + int(threadIdx.x);
     const bool wanted = i < candidates;
-    const int node = wanted ? list[i] : 0, local = node % kBlockNodes<D>;
-    const SlotPoses<T, D> poses(a.contact, stored_slot(wanted, a.contact, near, node));
+    const int entry = wanted ? list[i] : 0;
+    NodeTouch<T, D> touch;
+    find_touch_of(wanted, entry, touch);
+    const bool meets = add_lone(touch.obstacle >= 0, entry, touch.obstacle, touch.normal);
+    const bool keeps = meets || touch.obstacle == touch.several;
+    const int at = place(keeps, several);  // a thread has read its candidate by then
+    if (keeps) list[at] = entry;
+  }
+
+  // Stores nodes that meet one surface. Returns whether there is no room for a node.
+  __device__ bool add_lone(bool wanted, int entry, int obstacle, const Vector<T, D>& normal) {
+    if (lone_count + kThreads > lone_room) {
+      overflows = true;
+      return wanted;
+    }
+    const int at = place(wanted, lone_count);
+    if (wanted)
+      lone[at] = lone_node(a.contact, a.velocity, a.stride, node_of(entry),
+                           lattice_node<D>(slot_of(entry).corner, local_of(entry)), obstacle, normal);
+    return false;
+  }
+
+  // The same for nodes that may meet several surfaces.
+  __device__ void find_surfaces_of(int first, int several) {
+    const int i = first + int(threadIdx.x);
+    const bool wanted = i < several;
+    const int entry = wanted ? list[i] : 0;
+    BodyNode<T, D> node;
+    node.met.any = 0;
+    if (any_of_warp(wanted)) {
+      search_node(wanted, !overflows, entry, node);
+      join_warp();
+    }
+    const bool meets = wanted && node.met.any, single = meets && is_lone(a.contact, node);
+    const Constraint<T, D>& only = node.met.constraints.e[0];
+    const bool keeps = add_lone(single, entry, only.owner, only.normal) || (meets && !single);
+    const int at = place(keeps, count);
+    if (keeps) list[at] = entry;
+    if (keeps && at < room) nodes[at] = node;
+  }
+
+  __device__ __noinline__ void find_touch_of(bool wanted, int entry, NodeTouch<T, D>& touch) const {
+    if (!wanted) return;
+    const NearSlot<D>& slot = slot_of(entry);
+    touch = touch_of_parts(a.contact, memory.poses, slot.parts, node_position(a.contact, slot.corner, local_of(entry)));
+  }
+
+  // The surfaces of a node, if it meets any; `several` where it is known that it may meet several. By all threads of a
+  // warp, as `any_of_warp`.
+  __device__ __noinline__ void search_node(bool wanted, bool several, int entry, BodyNode<T, D>& result) const {
+    NodeTouch<T, D> touch;
+    const bool touches = wanted && !several;
+    if (any_of_warp(touches)) {
+      find_touch_of(touches, entry, touch);
+      join_warp();
+    }
+    const NearSlot<D>& slot = slot_of(entry);
+    ContactSlot<T, D> s{true, slot.parts.walled, scene, {}, slot.parts.near, slot.parts.touching, memory.rows};
+#pragma unroll
+    for (int i = 0; i < D; i++) s.corner[i] = slot.corner[i];
+    const SlotPoses<T, D> poses(a.contact, s);
+    const int local = local_of(entry);
+    const Vector<T, D> position = node_position(a.contact, s.corner, local);
     NodeContact<T, D> contact;
-    find_contact(wanted, poses, node_position(a.contact, poses.s.corner, local), contact);
+    several = wanted && (several || touch.obstacle == touch.several);
+    if (any_of_warp(several)) {
+      find_surfaces(several, poses, position, contact);
+      join_warp();
+    }
+    if (touch.obstacle >= 0) meet_alone(a.contact, memory.poses, touch.obstacle, position, contact);
     const bool meets = wanted && contact.count > 0;
-    const int at = place(meets, count);  // a thread has read its candidate by then
-    if (meets) list[at] = node;
-    const bool stores = meets && at < room;
-    if (any_of_warp(stores)) {
-      set_body_node(stores, poses, contact, node, local, nodes[stores ? at : 0]);
+    if (any_of_warp(meets)) {
+      set_body_node(meets, poses, contact, node_of(entry), local, result);
       join_warp();
     }
   }
 
-  // Node number i, with the velocities of its surfaces, its mass and its velocity. By all threads of a warp.
-  template <class Scene>
-  __device__ void load(bool wanted, int i, const Scene& scene, BodyNode<T, D>& node, T& mass, Vector<T, D>& v) const {
+  // Node number i of those that are not lone, with the velocities of its surfaces, its mass and its velocity. By all
+  // threads of a warp.
+  __device__ __noinline__ void load(bool wanted, int i, BodyNode<T, D>& node, T& mass, Vector<T, D>& v) const {
     const bool searches = wanted && i >= room;
     if (any_of_warp(searches)) {
-      search_node(searches, a.contact, near, searches ? list[i] : 0, node);
+      search_node(searches, false, list[searches ? i : 0], node);
       join_warp();
     }
     mass = T(0);
     v = zero_vector<T, D>();
     if (!wanted) return;
     if (!searches) node = nodes[i];
-    set_surface_velocities(scene.rows, node);
+    set_surface_velocities(memory.poses, node);
     mass = a.contact.mass[node.node * a.contact.mass_stride];
     v = load_node<T, D>(a.velocity, a.stride, node.node);
   }
 
   // ---- sums over the nodes
 
-  // sums[e] = Σ value(push, e) for `entries` numbers; fill(first, size) sets the pushes of a tile of nodes.
-  template <class Fill, class Value>
-  __device__ void add_up(int entries, double* sums, const Fill& fill, const Value& value) const {
-    const int chunks = entries < kThreads ? kThreads / entries : 1;
-    partial[threadIdx.x] = 0;
-    each(entries, [&](int e) { sums[e] = 0; });
-    __syncthreads();
-    for (int first = 0; first < count; first += kTile<T>) {
-      const int size = min(kTile<T>, count - first);
-      fill(first, size);
-      __syncthreads();
-      each(entries * chunks, [&](int t) {
-        const int e = t % entries;
-        double sum = 0;
-        for (int i = t / entries; i < size; i += chunks) sum += value(push[i], e);
-        (chunks > 1 ? partial[t] : sums[e]) += sum;
-      });
-      __syncthreads();
+  template <class Scene>
+  __device__ void add_up(const Scene&, double* impulses, double* slopes) const {
+    add_up(impulses, slopes);
+  }
+
+  // By the first warps, each with the nodes of every so many tiles. The sums of a warp have the order of its nodes, and
+  // those of the warps their own.
+  __device__ __noinline__ void add_up(double* impulses, double* slopes) const {
+    const int m = a.bodies * n, warp = int(threadIdx.x) / 32;
+    const int of_impulses = impulses ? m : 0, of_slopes = slopes ? m * m : 0, entries = of_impulses + of_slopes;
+    double *own_impulses = impulses, *own_slopes = slopes;
+    if (adders > 1) {
+      own_impulses = sums + warp * entries;
+      own_slopes = own_impulses + of_impulses;
+      each(adders * entries, [&](int i) { sums[i] = 0; });
+    } else {
+      each(of_impulses, [&](int i) { impulses[i] = 0; });
+      each(of_slopes, [&](int i) { slopes[i] = 0; });
     }
-    if (chunks == 1) return;
-    each(entries, [&](int e) {
-      double sum = 0;
-      for (int c = 0; c < chunks; c++) sum += partial[e + c * entries];
-      sums[e] = sum;
-    });
-    __syncthreads();
-  }
-
-  template <class Scene>
-  __device__ void add_up_impulses(const Scene& scene, double* sums) const {
-    add_up(
-        a.bodies * n, sums, [&](int first, int size) { fill_impulses(scene, first, size); },
-        [&](const NodePush<T, D>& p, int e) {
-          const int k = e / n;
-          double sum = 0;
-          for (int face = 0; face < p.faces; face++)
-            if (a.owner[p.obstacle[face]] == k) sum += impulse_along(p, face, scene.now[k], e % n);
-          return sum;
-        });
-  }
-
-  template <class Scene>
-  __device__ void add_up_slopes(const Scene& scene, double* sums) const {
-    const int m = a.bodies * n;
-    add_up(
-        m * m, sums, [&](int first, int size) { fill_slopes(scene, first, size); },
-        [&](const NodePush<T, D>& p, int e) {
-          const int row = e / m, column = e % m, k = row / n, l = column / n;
-          double sum = 0;
-          for (int by = 0; by < p.faces; by++) {
-            if (a.owner[p.obstacle[by]] != l) continue;
-            for (int face = 0; face < p.faces; face++)
-              if (a.owner[p.obstacle[face]] == k)
-                sum += slope_along(p, impulse_slope(p, face, by, scene.now[l], column % n), scene.now[k], row % n);
-          }
-          return sum;
-        });
-  }
-
-  // Impulses of a tile, by one thread per node.
-  template <class Scene>
-  __device__ void fill_impulses(const Scene& scene, int first, int size) const {
-    const int i = threadIdx.x;
-    if (i >= kTile<T>) return;  // whole warps
-    const bool wanted = i < size;
-    BodyNode<T, D> node;
-    T mass;
-    Vector<T, D> v;
-    load(wanted, first + i, scene, node, mass, v);
-    if (any_of_warp(wanted)) {
-      set_impulses(wanted, node, mass, v, push[i]);
+    sync();
+    if (any_of_warp(warp < adders)) {
+      add_nodes(warp, impulses ? own_impulses : nullptr, slopes ? own_slopes : nullptr);
       join_warp();
     }
-    if (wanted) set_faces(a.contact, node, push[i]);
+    sync();
+    if (adders == 1) return;
+    each(entries, [&](int e) {
+      double sum = 0;
+      MPM_LOOP for (int w = 0; w < adders; w++)
+        sum += sums[w * entries + e];
+      (e < of_impulses ? impulses[e] : slopes[e - of_impulses]) = sum;
+    });
+    sync();
   }
 
-  // Derivatives of the impulses of a tile, by a thread for each node and axis of a face.
-  template <class Scene>
-  __device__ void fill_slopes(const Scene& scene, int first, int size) const {
-    const int i = threadIdx.x % kTile<T>;
-    const bool wanted = i < size;
+  __device__ void add_nodes(int warp, double* impulses, double* slopes) const {
+    constexpr int tile = 32, seeded = 32 / (D * D);  // nodes of a warp
+    for (int first = warp * tile; first < lone_count; first += adders * tile)
+      add_lone_nodes(first + lane(), impulses, slopes);
+    for (int first = warp * tile; impulses && first < count; first += adders * tile)
+      add_impulses(first + lane(), impulses);
+    const int node = lane() / (D * D);  // the last lanes have none
+    for (int first = warp * seeded; slopes && first < count; first += adders * seeded)
+      add_slopes(node < seeded ? first + node : count, lane() % (D * D), slopes);
+  }
+
+  __device__ void add_lone_nodes(int i, double* impulses, double* slopes) const {
+    int k = -1;
+    double along[n], block[n * n];
+    if (i < lone_count) {
+      const LoneNode<T, D> node = lone[i];
+      const LoneContact<T, D> contact(a.contact, memory.poses, node);
+      k = a.owner[node.obstacle];
+      const Vector<double, D> at = arm_from(memory.now[k], contact.at);
+      set_along_motions(at, contact.impulse(), along);
+      if (slopes)
+        set_slope_block([&](int axis) { return contact.slope(axis); }, at, arm_from(memory.now[k], contact.position),
+                        block);
+    }
+    if (impulses) add_by_key(k, along, [&](int body, int e) { return impulses + (body * n + e); });
+    if (slopes) add_block(k, k, block, slopes);
+  }
+
+  // Adds blocks of lanes for the bodies k and l, negative where there is none.
+  __device__ void add_block(int k, int l, const double (&block)[n * n], double* slopes) const {
+    static_assert(kMaxObstacles <= 256);
+    const int m = a.bodies * n;
+    add_by_key(k < 0 ? -1 : k << 8 | l, block, [&](int pair, int e) {
+      return slopes + (int64_t((pair >> 8) * n + e / n) * m + (pair & 255) * n + e % n);
+    });
+  }
+
+  // Impulses on the faces of a node.
+  __device__ void add_impulses(int i, double* sums) const {
+    const bool wanted = i < count;
     BodyNode<T, D> node;
+    NodePush<T, D> push;
     T mass;
     Vector<T, D> v;
-    load(wanted, first + i, scene, node, mass, v);
-    const bool one = wanted && node.met.constraints.count == 1;
-    if (wanted && threadIdx.x < kTile<T>) {
-      set_faces(a.contact, node, push[i]);
-      if (one) set_slopes_of_one(node, mass, v, push[i]);
+    load(wanted, i, node, mass, v);
+    TakenVelocities<T, D> taken;
+    if (any_of_warp(wanted)) {
+      take_from_node(wanted, node, v, taken);
+      join_warp();
     }
-    for (int seed = threadIdx.x / kTile<T>; seed < D * D; seed += kThreads / kTile<T>) {
-      const Constraints<T, D>& c = node.met.constraints;
-      const bool acts = wanted && !one && seed / D < c.count && c.e[seed / D].owner >= 0;
-      if (any_of_warp(acts)) {
-        set_slopes(acts, node, mass, v, seed / D, seed % D, push[i]);
-        join_warp();
+    if (wanted) {
+      set_impulses(node, mass, taken, push);
+      set_faces(a.contact, node, push);
+    }
+    MPM_LOOP for (int face = 0; face < D; face++) {
+      const int k = wanted && face < push.faces ? a.owner[push.obstacle[face]] : -1;
+      double along[n];
+      if (k >= 0) {
+        Vector<double, D> impulse;
+#pragma unroll
+        for (int axis = 0; axis < D; axis++) impulse[axis] = double(push.impulse[face][axis]);
+        set_along_motions(arm_from(memory.now[k], push.at), impulse, along);
       }
+      add_by_key(k, along, [&](int body, int e) { return sums + (body * n + e); });
+    }
+  }
+
+  // Derivatives of the impulses on the faces of a node by the velocity of face `seed / D` along axis `seed % D`.
+  __device__ void add_slopes(int i, int seed, double* sums) const {
+    const bool wanted = i < count;
+    BodyNode<T, D> node;
+    NodePush<T, D> push;
+    PushSlope<T, D> slope;
+    T mass;
+    Vector<T, D> v;
+    load(wanted, i, node, mass, v);
+    push.faces = 0;
+    if (wanted) set_faces(a.contact, node, push);
+    const int by = seed / D, axis = seed % D;
+    const bool acts = by < push.faces;
+    if (any_of_warp(acts)) {
+      set_slopes(acts, node, mass, v, by, axis, slope);
+      join_warp();
+    }
+    const int l = acts ? a.owner[push.obstacle[by]] : -1;
+    MPM_LOOP for (int face = 0; face < D; face++) {
+      const int k = acts && face < push.faces ? a.owner[push.obstacle[face]] : -1;
+      double block[n * n];
+      if (k >= 0)
+        set_slope_block(slope_by_axis(slope, face, axis), arm_from(memory.now[k], push.at),
+                        arm_from(memory.now[l], push.position), block);
+      add_block(k, l, block, sums);
     }
   }
 
   template <class Scene>
-  __device__ void change_nodes(const Scene& scene) const {
+  __device__ void change_nodes(const Scene&) const {
+    each(lone_count, [&](int i) {
+      const LoneNode<T, D> node = lone[i];
+      store(node.node, node.velocity + LoneContact<T, D>(a.contact, memory.poses, node).change());
+    });
     for (int first = 0; first < count; first += kThreads) {
       const int i = first + int(threadIdx.x);
       const bool wanted = i < count;
       BodyNode<T, D> node;
       T mass;
       Vector<T, D> v;
-      load(wanted, i, scene, node, mass, v);
+      load(wanted, i, node, mass, v);
+      TakenVelocities<T, D> taken;
       if (any_of_warp(wanted)) {
-        change_velocity(wanted, node, v);
+        take_from_node(wanted, node, v, taken);
         join_warp();
       }
-      for (int axis = 0; wanted && axis < D; axis++) a.velocity[node.node * a.stride + axis] = v[axis];
+      if (wanted) store(node.node, without(taken, v));
     }
+  }
+
+  __device__ void store(int node, const Vector<T, D>& v) const {
+#pragma unroll
+    for (int axis = 0; axis < D; axis++) a.velocity[node * a.stride + axis] = v[axis];
   }
 };
 
+// Least number of blocks of a multiprocessor.
+template <int kThreads, class T>
+constexpr int kLeastBlocks = kThreads == kFewThreads ? (sizeof(T) == 4 ? 16 : 8) : 1;
+
 template <int kThreads, class T, int D>
-__global__ void __launch_bounds__(kThreads)
+__global__ void __launch_bounds__(kThreads, kLeastBlocks<kThreads, T>)
     free_bodies_kernel(const __grid_constant__ FreeBodiesArguments<T, D> a, const BodiesMemory<T, D> memory) {
+  using Team = BlockTeam<kThreads, T, D>;
+  using Bodies = SceneBodies<T, D, Team>;
   extern __shared__ double shared[];
   __shared__ int of_warps[kThreads / 32];
-  double* const numbers_here = shared + kThreads;
-  const int scene = blockIdx.x, m = a.bodies * kMotions<D>;
-  const int64_t count = SceneNumbers::count(a.bodies, m);
-  double* const numbers = memory.shares ? numbers_here : memory.numbers + scene * count;
-  BodyNow<D>* const now =
-      memory.shares ? reinterpret_cast<BodyNow<D>*>(numbers_here + count) : memory.now + int64_t(scene) * a.bodies;
-  char* const rest = memory.shares ? reinterpret_cast<char*>(now + a.bodies) : reinterpret_cast<char*>(numbers_here);
+  const int scene = blockIdx.x;
+  double* sums;
+  const SceneMemory<T, D> here = memory.of_scene(a, scene, shared, sums);
   const SceneSlots slots = slots_of_scene(a, scene);
-  BlockTeam<kThreads, T, D> team{a,
-                                 memory.near,
-                                 memory.list + slots.before() * kBlockNodes<D>,
-                                 memory.nodes + slots.before() * kRoom,
-                                 slots.total() * kRoom,
-                                 reinterpret_cast<NodePush<T, D>*>(rest),
-                                 shared,
-                                 of_warps};
-  SceneBodies<T, D, BlockTeam<kThreads, T, D>> bodies(a, scene, now, numbers, team);
-  bodies.begin();
-  team.find_nodes(slots, memory.near);
-  bodies.solve();
+  const int64_t before = slots.before();
+  Team team{a,
+            scene,
+            here,
+            memory.near + before,
+            memory.list + before * kBlockNodes<D>,
+            memory.nodes + before * kRoom,
+            memory.lone + (before * kLoneRoom<D> + int64_t(scene) * kThreads),
+            slots.total() * kRoom,
+            slots.total() * kLoneRoom<D> + kThreads,
+            memory.adders,
+            sums,
+            of_warps};
+  Bodies::begin(a, scene, here, team);
+  team.find_slots(slots);
+  grid_dependency_sync();
+  team.find_nodes();
+  Bodies(a, scene, here, team).solve();
 }
 
 template <int kThreads, class T, int D>
 void run(const FreeBodiesArguments<T, D>& a, Stream stream) {
   const BodiesMemory<T, D> memory(a, a.workspace);
-  launch(free_bodies_kernel<kThreads, T, D>, unsigned(a.scenes), kThreads, size_t(memory.shared_bytes(a, kThreads)),
-         stream, a, memory);
+  launch_in_chain(free_bodies_kernel<kThreads, T, D>, unsigned(a.scenes), kThreads, size_t(memory.shared_bytes(a)),
+                  stream, a, memory);
 }
 
 }  // namespace
@@ -384,7 +543,9 @@ int64_t free_bodies_workspace(const FreeBodiesArguments<T, D>& a) {
 
 template <class T, int D>
 void free_bodies(const FreeBodiesArguments<T, D>& a, Stream stream) {
-  a.scenes < kManyScenes ? run<kManyThreads>(a, stream) : run<kFewThreads>(a, stream);
+  const int threads = threads_of(a);
+  if (threads == kFewThreads) return run<kFewThreads>(a, stream);
+  threads == kSomeThreads ? run<kSomeThreads>(a, stream) : run<kManyThreads>(a, stream);
 }
 
 MPM_INSTANTIATE_SIZE(free_bodies_workspace, FreeBodiesArguments)

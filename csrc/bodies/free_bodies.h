@@ -11,14 +11,11 @@ namespace mpm {
 
 template <class T, int D>
 struct FreeBodiesArguments {
-  // Of the obstacles of all bodies, whose rows [scenes, obstacles] the kernel writes; with the mass of the nodes.
+  // Of the obstacles of all bodies, with friction and shape in their rows; with the mass of the nodes.
   ContactArguments<T, D> contact;
   // On CUDA: slots before those of the margin of an activation; both are in the order of their blocks.
   int first_slots = 0;
-  ObstacleRow<T, D>* row = nullptr;          // those rows
-  const ObstacleRow<T, D>* given = nullptr;  // [given_rows, obstacles] with friction and shape
-  int given_rows = 0;                        // 1, or one per scene
-  T* velocity = nullptr;                     // of node i at velocity + i * stride, changed in place
+  T* velocity = nullptr;  // of node i at velocity + i * stride, changed in place
   int64_t stride = 0;
   int scenes = 0, bodies = 0;
   int owner[kMaxObstacles];                     // the body of an obstacle
@@ -77,8 +74,8 @@ MPM_HD void solve_in_place(const Team& team, double* matrix, int m) {
     int pivot = k;
     MPM_LOOP for (int i = k + 1; i < m; i++)
       if (abs(matrix[i * width + k]) > abs(matrix[pivot * width + k])) pivot = i;
-    team.sync();
     if (pivot != k) {
+      team.sync();  // all have read the column
       team.each(width - k, [&](int j) {
         double &upper = matrix[k * width + k + j], &lower = matrix[pivot * width + k + j];
         const double kept = upper;
@@ -87,9 +84,10 @@ MPM_HD void solve_in_place(const Team& team, double* matrix, int m) {
       team.sync();
     }
     const int columns = m - k;
+    const double inverse = 1 / matrix[k * width + k];
     team.each((m - 1) * columns, [&](int e) {
       const int other = e / columns, i = other < k ? other : other + 1, j = k + 1 + e % columns;
-      matrix[i * width + j] -= matrix[i * width + k] / matrix[k * width + k] * matrix[k * width + j];
+      matrix[i * width + j] -= matrix[i * width + k] * inverse * matrix[k * width + j];
     });
     team.sync();
   }
@@ -97,73 +95,84 @@ MPM_HD void solve_in_place(const Team& team, double* matrix, int m) {
   team.sync();
 }
 
+// The memory of a scene for its bodies and their obstacles.
+template <class T, int D>
+struct SceneMemory {
+  BodyNow<D>* now;            // [bodies]
+  ObstacleRow<T, D>* rows;    // [obstacles], with their positions and present velocities
+  ObstaclePose<T, D>* poses;  // [obstacles], of these rows
+  double* numbers;            // [SceneNumbers::count]
+};
+
 // The bodies of one scene. A team of threads calls all functions together: `team.each(count, f)` calls f(i) for each
 // number, `team.sync()` waits for all threads, and the sums over the nodes are the team's, complete on return:
-// `add_up_impulses(scene, sums)` and `add_up_slopes(scene, sums)`. `change_nodes(scene)` changes the velocities.
+// `add_up(scene, impulses, slopes)`, either of which may be null. `change_nodes(scene)` changes the velocities.
 template <class T, int D, class Team>
 class SceneBodies {
  public:
   static constexpr int n = kMotions<D>;
 
-  MPM_HD SceneBodies(const FreeBodiesArguments<T, D>& arguments, int scene, BodyNow<D>* now, double* numbers,
+  MPM_HD SceneBodies(const FreeBodiesArguments<T, D>& arguments, int scene, const SceneMemory<T, D>& memory,
                      const Team& team)
       : a(arguments),
-        now(now),
-        rows(a.row + int64_t(scene) * a.contact.obstacles),
+        now(memory.now),
+        poses(memory.poses),
         scene_(scene),
         m_(a.bodies * n),
-        s_(numbers, a.bodies, m_),
+        rows_(memory.rows),
+        s_(memory.numbers, a.bodies, m_),
         team_(team) {}
 
   const FreeBodiesArguments<T, D>& a;
-  BodyNow<D>* const now;          // [bodies]
-  ObstacleRow<T, D>* const rows;  // [obstacles]
+  const BodyNow<D>* const now;
+  const ObstaclePose<T, D>* const poses;
 
-  // Reads the bodies, and places their obstacles.
-  MPM_HD void begin() const {
-    team_.each(a.bodies, [&](int k) {
-      const double* const gravity = a.gravity + (a.gravity_rows == 1 ? 0 : int64_t(scene_) * D);
-      now[k] = body_now(a.constants[k], a.joint[k], a.begin + body(k) * kBodyRow<D>, gravity,
-                        a.wrench ? a.wrench + body(k) * n : nullptr, dt());
-      for (int i = 0; i < n; i++) s_.U[k * n + i] = now[k].predicted[i];
+  // Reads the bodies, and places their obstacles at rest.
+  MPM_HD static void begin(const FreeBodiesArguments<T, D>& a, int scene, const SceneMemory<T, D>& memory,
+                           const Team& team) {
+    team.each(a.bodies, [&](int k) {
+      const double* const gravity = a.gravity + (a.gravity_rows == 1 ? 0 : int64_t(scene) * D);
+      const int64_t body = int64_t(scene) * a.bodies + k;
+      memory.now[k] = body_now(a.constants[k], a.joint[k], a.begin + body * kBodyRow<D>, gravity,
+                               a.wrench ? a.wrench + body * n : nullptr, dt_of(a, scene));
     });
-    team_.sync();
-    const ObstacleRow<T, D>* const given = a.given + (a.given_rows == 1 ? 0 : int64_t(scene_) * a.contact.obstacles);
-    team_.each(a.contact.obstacles, [&](int o) {
-      rows[o] = given[o];
-      place_part(now[a.owner[o]], a.parts[o], rows[o]);
+    team.sync();
+    team.each(a.contact.obstacles, [&](int o) {
+      const int64_t given = a.contact.rows == 1 ? o : int64_t(scene) * a.contact.obstacles + o;
+      memory.rows[o] = a.contact.row[given];
+      place_part(memory.now[a.owner[o]], a.parts[o], memory.rows[o]);
+      memory.poses[o] = obstacle_pose(a.contact, a.contact.kind[o], memory.rows[o], scene);
     });
-    team_.sync();
+    team.sync();
   }
 
   // Solves for the velocities, changes the nodes and writes rows and report. After `begin`, once the nodes are known.
   MPM_HD void solve() {
-    evaluate(s_.U, s_.impulse, s_.residual, s_.size);
+    team_.each(m_, [&](int i) { s_.U[i] = now[i / n].predicted[i % n]; });
+    team_.sync();
+    evaluate(s_.U, s_.impulse, s_.residual, s_.size, s_.slopes);
     team_.each(a.bodies, [&](int k) {
       s_.scale[k] = size_of_motion(now[k], now[k].predicted) + s_.size[k] + std::numeric_limits<double>::min();
     });
     team_.sync();
     int iterations = 0;
-    bool has_slopes = false;
+    bool has_slopes = true, moves = true;  // whether slopes are those of U, and obstacles move by U
     double share = 1;
     MPM_LOOP while (iterations < a.max_iterations && !is_converged()) {
       iterations++;
-      if (!has_slopes) {
-        move_parts(s_.U);
-        team_.add_up_slopes(*this, s_.slopes);
-        has_slopes = true;
-      }
+      if (!has_slopes) team_.add_up(*this, nullptr, s_.slopes);
+      has_slopes = true;
       find_step();
       team_.each(m_, [&](int i) { s_.trial[i] = s_.U[i] - share * s_.matrix[i * (m_ + 1) + m_]; });
       team_.sync();
-      evaluate(s_.trial, s_.trial_impulse, s_.trial_residual, s_.trial_size);
-      const bool better = norm(s_.trial_size, a.bodies) < norm(s_.size, a.bodies);
-      share = better ? 1 : 0.5 * share;
-      if (better) take_trial();
-      if (better) has_slopes = false;
+      evaluate(s_.trial, s_.trial_impulse, s_.trial_residual, s_.trial_size, nullptr);
+      moves = norm(s_.trial_size, a.bodies) < norm(s_.size, a.bodies);
+      share = moves ? 1 : 0.5 * share;
+      if (moves) take_trial();
+      if (moves) has_slopes = false;
       team_.sync();
     }
-    move_parts(s_.U);
+    if (!moves) move_parts(s_.U);
     if (a.motion) write_solution(has_slopes);
     team_.change_nodes(*this);
     team_.each(a.bodies, [&](int k) { finish(k, iterations); });
@@ -171,10 +180,13 @@ class SceneBodies {
 
  private:
   const int scene_, m_;  // number of unknowns
+  ObstacleRow<T, D>* const rows_;
   SceneNumbers s_;
   const Team& team_;
 
-  MPM_HD double dt() const { return a.scene_dt ? a.dt * double(a.scene_dt[scene_]) : a.dt; }
+  MPM_HD static double dt_of(const FreeBodiesArguments<T, D>& a, int scene) {
+    return a.scene_dt ? a.dt * double(a.scene_dt[scene]) : a.dt;
+  }
   MPM_HD int64_t body(int k) const { return int64_t(scene_) * a.bodies + k; }
 
   MPM_HD static double norm(const double* values, int count) {
@@ -200,14 +212,14 @@ class SceneBodies {
 
   MPM_HD void move_parts(const double* U) {
     team_.each(a.contact.obstacles,
-               [&](int o) { move_part(now[a.owner[o]], a.parts[o], U + a.owner[o] * n, rows[o]); });
+               [&](int o) { move_part(now[a.owner[o]], a.parts[o], U + a.owner[o] * n, rows_[o]); });
     team_.sync();
   }
 
-  // Impulses, residual U − U* − W p and its size for each body, of velocities U.
-  MPM_HD void evaluate(const double* U, double* impulse, double* residual, double* size) {
+  // Impulses, residual U − U* − W p and its size for each body, of velocities U; and the slopes, unless null.
+  MPM_HD_CALL void evaluate(const double* U, double* impulse, double* residual, double* size, double* slopes) {
     move_parts(U);
-    team_.add_up_impulses(*this, impulse);
+    team_.add_up(*this, impulse, slopes);
     team_.each(a.bodies, [&](int k) {
       for (int i = 0; i < n; i++)
         residual[k * n + i] = U[k * n + i] - now[k].predicted[i] - applied(now[k], impulse + k * n, i);
@@ -241,7 +253,7 @@ class SceneBodies {
   }
 
   MPM_HD void write_solution(bool has_slopes) {
-    if (!has_slopes) team_.add_up_slopes(*this, s_.slopes);
+    if (!has_slopes) team_.add_up(*this, nullptr, s_.slopes);
     const int64_t first = int64_t(scene_) * m_;
     team_.each(m_, [&](int i) { a.motion[first + i] = s_.U[i]; });
     team_.each(m_ * m_, [&](int e) { a.slopes[first * m_ + e] = s_.slopes[e]; });
@@ -252,7 +264,7 @@ class SceneBodies {
   MPM_HD void finish(int k, int iterations) {
     double motion[n];
     for (int i = 0; i < n; i++) motion[i] = now[k].predicted[i] + applied(now[k], s_.impulse + k * n, i);
-    end_of_step(a.constants[k], a.joint[k], now[k], motion, dt(), a.end + body(k) * kBodyRow<D>);
+    end_of_step(a.constants[k], a.joint[k], now[k], motion, dt_of(a, scene_), a.end + body(k) * kBodyRow<D>);
     double* const report = a.report + int64_t(scene_) * (1 + a.bodies);
     const double residual = s_.size[k] / s_.scale[k], before = report[1 + k];
     if (before == before && !(residual <= before)) report[1 + k] = residual;  // NaN stays

@@ -108,6 +108,17 @@ MPM_HD Vector<double, D> motion_at(const double* motion, const Vector<double, D>
   return v;
 }
 
+// A vector at an arm, along each number of a motion: its components, followed by its moment.
+template <int D>
+MPM_HD void set_along_motions(const Vector<double, D>& arm, const Vector<double, D>& v, double (&along)[kMotions<D>]) {
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    along[i] = v[i];
+  MPM_UNROLL for (int i = 0; i < kTurns<D>; i++) {
+    const int j = D == 2 ? 0 : (i + 1) % 3, k = D == 2 ? 1 : (i + 2) % 3;
+    along[D + i] = arm[j] * v[k] - arm[k] * v[j];
+  }
+}
+
 // ---- a body at the beginning of a step
 
 template <int D>
