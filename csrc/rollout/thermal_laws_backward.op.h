@@ -37,7 +37,8 @@ class ThermalLawsBackward {
       if (laws().material(k).has_elastic()) backend::end_thermal_laws_backward(arguments(k, i, adjoints), stream_);
   }
 
-  // Sets what the adjoint of law k reads and writes in place of the adjoints of the material.
+  // Sets what the adjoint of law k reads and writes in place of the adjoints of the material. Laws with history are
+  // plastic; others add to what `before_laws` has written.
   void set(size_t k, LawBackwardArguments<T, D>& a) const {
     const size_t first = laws().first_of(k);
     if (!laws().material(first).has_elastic()) return;

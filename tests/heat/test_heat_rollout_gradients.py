@@ -353,7 +353,7 @@ def test_obstacles_beside_a_held_surface(dim, shape, scenes, device):
                 assert found is None
                 continue
             error, scale = float((found - expected).abs().max()), float(expected.abs().max())
-            assert error <= 1e-9 * scale, f"{name}: {error / scale}"
+            assert error <= (1e-8 if state.x.is_cuda else 1e-10) * scale, f"{name}: {error / scale}"
         used = dict(zip(leaves, grads[0], strict=True))
         assert float(used["at"].abs().max()) > 0 and float(used["other"].abs().max()) > 0
 
@@ -491,8 +491,9 @@ def test_parameters_of_laws_that_read_the_temperature(dim, name, scenes, checkpo
     ends = mpm.rollout(step, state, 4, dt, checkpoint=checkpoint), composed(step, state, 4, dt)
     grads = [torch.autograd.grad(loss_of(end, ["v", "F", "J"]), leaves) for end in ends]
     for found, expected in zip(*grads, strict=True):
-        assert float(expected.abs().max()) > 0
-        torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-10 * float(expected.abs().max()))
+        largest = float(expected.abs().max())
+        assert largest > 0
+        torch.testing.assert_close(found, expected, rtol=0, atol=(1e-8 if state.x.is_cuda else 1e-10) * largest)
 
 
 def test_reasons_for_single_steps(device):
