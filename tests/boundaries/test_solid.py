@@ -631,6 +631,28 @@ def test_particles_deep_inside_several_obstacles_are_moved_out_of_all(device, di
 # ---- thin walls
 
 
+@pytest.mark.parametrize("angle", [0.0, 0.3, math.pi / 4])
+@pytest.mark.parametrize("thick", [0.025, 0.04, 0.06])
+def test_walls_of_sampled_shapes_are_as_thick_as_they_are(dim, thick, angle):
+    """A hollow vessel that is turned against the samples, a ball, and a wall without a sample inside."""
+    spacing, c, s = 0.01, math.cos(angle), math.sin(angle)
+
+    def vessel(x):
+        a, b = (c * x[:, 0] + s * x[:, 1], c * x[:, 1] - s * x[:, 0])
+        x = torch.stack([a, b, *x.T[2:]], 1)
+        outer, inner = (half - x.abs() for half in (0.15, 0.15 - thick))
+        opened = torch.cat([inner[:, :1], x[:, 1:2] + 0.15 - thick, inner[:, 2:]], 1)  # above
+        return torch.maximum(-outer.amin(1), opened.amin(1))
+
+    corner = [0.23] * dim
+    shapes = [mpm.shapes.SDF(vessel), mpm.shapes.Sphere(thick)]
+    found = [mpm.shapes.Sampled.of(one, [-a for a in corner], corner, spacing).thinnest_wall() for one in shapes]
+    assert thick <= found[0] + 1e-9 and found[0] < thick + 1.01 * spacing
+    assert 2 * thick <= found[1] + 1e-9 and found[1] < 2 * thick + 1.01 * spacing
+    thin = mpm.shapes.Sampled.of(mpm.shapes.Box([0.004] * dim), [-0.105] * dim, [0.105] * dim, spacing)
+    assert thin.thinnest_wall() == spacing
+
+
 def test_thin_walls_are_reported_by_name():
     cup = [(0, 0), (0.12, 0), (0.12, 0.2), (0.08, 0.2), (0.08, 0.04), (0, 0.04)]
     thin = [(r, z - 0.01 if z == 0.04 else z) for r, z in cup]

@@ -570,7 +570,7 @@ class Step(TensorModule):
             PrecisionWarning: where the positions of the state do not resolve the cells, see `Grid`.
             FrontWarning: where steps were so long that fronts between phases lag behind, see `Heat`.
             LockingWarning: where an elastic law is nearly incompressible. A new step warns of values on the CPU.
-            ThinWallWarning: for boxes and revolved shapes that are thinner than 4 dx.
+            ThinWallWarning: for boxes, revolved and sampled shapes that are thinner than 4 dx.
 
         Raises:
             SimulationError: that names each scene (up to a dozen of a kind), when and how many, and has `failures`: if

@@ -114,6 +114,16 @@ class Sampled(Shape):
         shape.values = data[2 * dim + 1 :].reshape([int(n) for n in data[dim + 1 : 2 * dim + 1]])
         return shape
 
+    def thinnest_wall(self) -> float:
+        """By the samples in the middle of walls, which are no less deep than their neighbours; a wall between samples
+        may be thinner by a spacing. The spacing where no sample is inside."""
+        depth, pool = -self.values, torch.nn.functional.max_pool2d
+        if depth.dim() == 3:
+            pool = torch.nn.functional.max_pool3d
+        deepest = pool(depth[None, None], 3, 1, 1)[0, 0]
+        middle = depth[(depth > 0) & (depth >= deepest - 1e-6 * self.spacing)]
+        return self.spacing + (2 * float(middle.min()) if len(middle) else 0.0)
+
     def data_count(self) -> int:
         return 2 * self.values.dim() + 1 + self.values.numel()
 
