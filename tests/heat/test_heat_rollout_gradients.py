@@ -262,7 +262,8 @@ def test_differences_over_200_steps_with_melting(transfer, law, device):
             expected = float(end(name, h)[0] - end(name, -h)[0]) / (2 * h)
         # On CUDA sums of nodes have another order in each run.
         least = 0.1 if state.x.is_cuda or law != "fluid" else 0.01
-        assert abs(found - expected) <= 1e-6 * max(abs(found), least), f"{name}: {found} and {expected}"
+        rounding = 4 * torch.finfo(F64).eps * abs(float(loss.detach())) / h  # of the differences
+        assert abs(found - expected) <= 1e-6 * max(abs(found), least) + rounding, f"{name}: {found} and {expected}"
 
 
 @pytest.mark.parametrize(*in_pairs(with_held=[False, True], name=[*terms(), "all"], dim=[2, 3], melts=[False, True]))
