@@ -1,10 +1,11 @@
 """Rollouts of unsorted particles, which are sorted for many steps and restored to their order."""
 
+import heat_scenes
 import pytest
 import torch
 from cases.rollout_gradients import assert_same, gradients, moving
 from cases.rollouts import F64, LAWS_HERE, TRANSFERS, assert_equal, one_by_one
-from helpers import OpNames
+from helpers import OpNames, relative_error
 from torch import Tensor
 
 import torch_mpm as mpm
@@ -83,6 +84,25 @@ def test_particles_are_sorted_again(monkeypatch, dim, device, sorts):
     with OpNames() as names:
         mpm.rollout(step, state, 12, DT)
     assert "aten.all.default" not in names.seen
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("given", ["unsorted", "in an order of one's own"])
+def test_particles_with_heat_are_sorted_again(monkeypatch, given, dim, device, sorts):
+    """Also those that were given in an order; their ids come back."""
+    step, state = heat_scenes.scene(dim, melts=True, device=device)
+    if given != "unsorted":
+        state = state.replace(ids=torch.randperm(len(state)).to(device))
+    monkeypatch.setattr(fused_op, "STEPS_WITH_HEAT", 5)
+    whole = plan.plan_call
+    monkeypatch.setattr(plan, "plan_call", lambda *a: whole(*a)._replace(order=1))
+    plan._planned.cache_clear()
+    end = mpm.rollout(step, state, 12, DT)
+    assert len(sorts) == 3 and end.ids is state.ids and end.mass is state.mass
+    expected = one_by_one(step, state, 12, DT)
+    assert_equal(end, expected)
+    assert relative_error(end.temperature, expected.temperature) < 1e-9
+    assert relative_error(end.extra["liquid"], expected.extra["liquid"]) < 1e-9
 
 
 @torch.no_grad()

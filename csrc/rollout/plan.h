@@ -99,6 +99,11 @@ constexpr int64_t kMostPathBytes = 1 << 26;  // of a call, for obstacles on path
 // a step of unsorted particles takes up to five times as long on a GPU.
 constexpr int64_t kLeastSortedSteps = 64, kLeastSortedParticles = 1 << 15;
 
+// The same for particles with heat in any order, which they lose while the steps of a long call move them
+// (`STEPS_IN_ORDER` in torch_mpm/rollouts/sorting.py): on an H200 a step of 8M particles takes a fifth longer after 80
+// of them, and sorting as long as two.
+constexpr int64_t kLeastHeatedSteps = 128, kLeastHeatedParticles = 1 << 18;
+
 // Whether a block per scene is faster than kernels of whole grids, by times measured on an H200 [µs].
 template <int D>
 bool block_per_scene_pays(int64_t particles, int64_t scenes) {
@@ -302,7 +307,7 @@ inline PlannedPool pool_for(const PlanFacts& f) {
   return {-1, kGrowingSteps};
 }
 
-// Order of unsorted particles.
+// Order of the particles in the steps.
 enum Order : int64_t {
   kAsGiven,
   kSortedBefore,  // sorted before the call, restored after it
@@ -310,8 +315,10 @@ enum Order : int64_t {
 };
 
 inline Order order_for(const PlanFacts& f) {
-  if (!f.cuda || f.captured || f.sorted || f.steps < kLeastSortedSteps || f.particles < kLeastSortedParticles)
-    return kAsGiven;
+  if (!f.cuda || f.captured) return kAsGiven;
+  if (f.heat && !f.gradients && f.steps >= kLeastHeatedSteps && f.particles >= kLeastHeatedParticles)
+    return kSortedBefore;
+  if (f.sorted || f.steps < kLeastSortedSteps || f.particles < kLeastSortedParticles) return kAsGiven;
   const bool itself = f.particles >= kLeastFusedParticles && !f.scene_ids && !f.gradients;
   return itself && why_not_many_phases(f).empty() ? kSortedByCall : kSortedBefore;
 }

@@ -159,6 +159,11 @@ def test_decisions(facts, changes, schedule, blocks, steps):
         ({"particles": 2**18, "gradients": True}, 1),
         ({"particles": 2**18, "scene_ids": True}, 1),
         ({"particles": 2**18, "laws": 2}, 1),
+        ({"particles": 2**18, "heat": True, "steps": 128}, 1),
+        ({"particles": 2**18, "heat": True, "steps": 128, "sorted": True}, 1),
+        ({"particles": 2**18, "heat": True, "steps": 127, "sorted": True}, 0),
+        ({"particles": 2**18 - 1, "heat": True, "steps": 128, "sorted": True}, 0),
+        ({"particles": 2**18, "heat": True, "steps": 128, "sorted": True, "gradients": True}, 0),
     ],
 )
 def test_order_of_particles(changes, order):

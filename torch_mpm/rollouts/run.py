@@ -77,7 +77,7 @@ def rollout(
 
     - float32 without gradients;
     - many unsorted particles (`state.ids` is None): for 64 steps or more they are sorted first, and restored to their
-      order at the end.
+      order at the end. With heat all of 2^18 particles or more are, every 64 steps, for 128 steps or more.
 
     The status does not count blocks that exist only between two activations.
 

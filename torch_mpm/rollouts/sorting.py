@@ -11,8 +11,9 @@ from ..laws import Mixture
 from ..state.state import PARTICLE_FIELDS, State, _take_all
 from ..step.step import Step
 
-STEPS_IN_ORDER = 1024
-"""Number of steps after which particles are sorted again."""
+STEPS_IN_ORDER, STEPS_WITH_HEAT = 1024, 64
+"""Numbers of steps after which particles are sorted again, without heat and with it: the op keeps those without heat in
+the order of its blocks."""
 
 
 def sort_particles(step: Step, state: State) -> State:
@@ -20,6 +21,11 @@ def sort_particles(step: Step, state: State) -> State:
     if isinstance(step.law, Mixture):
         step.law.check_material(state)
     return step.sorted(state)
+
+
+def without_ids(state: State) -> State:
+    """The state without the ids of an earlier order, so that those of `sort_particles` refer to the present one."""
+    return state if state.ids is None else state.replace(ids=None)
 
 
 def restore_order(step: Step, end: State, start: State, given: State) -> State:
