@@ -443,7 +443,7 @@ void SortedCpu<T, D>::pass(bool follows) {
     v.go(false);  // values of particles outside; those of others are not read before the last pass
     if (in_.wants_C) C.go(false);
     find_rows(false);
-    find_prefetched(false);
+    find_prefetched(heat.has_value());
     moved_ = true;
   }
   set_p2g();
