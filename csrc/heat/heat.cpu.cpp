@@ -1,3 +1,5 @@
+#include <type_traits>
+
 #include "cpu/parallel.h"
 #include "heat/cell.h"
 #include "heat/patches.h"
@@ -6,9 +8,9 @@
 #include "transfer/own_nodes.cpu.h"
 #include "transfer/scatter.cpu.h"
 
-// H applied in one pass: four rows of cells of a base block are in the lanes of packs, which add up the particles of each
-// cell without sums over lanes. Base blocks add their tiles colour by colour, so that every sum has the same order for
-// any number of threads.
+// H applied in one pass: four rows of cells of a base block are in the lanes of packs, which add up the particles of
+// each cell without sums over lanes. Base blocks add their tiles colour by colour, so that every sum has the same order
+// for any number of threads.
 namespace mpm::cpu {
 inline namespace TORCH_MPM_ISA {
 
@@ -23,11 +25,12 @@ struct ScalarTile {
 
   // Place of the first node of a cell, and those of the nodes that are further along the axes from there.
   static int first_of(int cell) {
-    return offset(D == 3 ? cell_coordinate<D>(cell, 0) : 0, cell_coordinate<D>(cell, D - 2), cell_coordinate<D>(cell, D - 1));
+    return offset(D == 3 ? cell_coordinate<D>(cell, 0) : 0, cell_coordinate<D>(cell, D - 2),
+                  cell_coordinate<D>(cell, D - 1));
   }
   static constexpr int offset(int i, int j, int k) { return (i * kWidth + j) * kRow + k; }
 
-  // visit(tile values, node row of the pool, nodes) for every run of nodes in an active block
+  // visit(tile values, node row of the pool, nodes) for every run of nodes in an active block, `nodes` a constant
   template <class F>
   MPM_HD void for_runs(const BaseBlock<T, D>& base_block, const F& visit) {
     for (int row = 0; row < kRows; row++) {
@@ -35,19 +38,23 @@ struct ScalarTile {
       const int o = (D == 3 ? i / kBlockWidth * 4 : 0) + j / kBlockWidth * 2;
       const int inside = (i % kBlockWidth * kBlockWidth + j % kBlockWidth) * kBlockWidth;
       const int low = base_block.slot[o], high = base_block.slot[o + 1];
-      if (low >= 0) visit(value + row * kRow, int64_t(low) * kBlockNodes<D> + inside, kBlockWidth);
-      if (high >= 0) visit(value + row * kRow + kBlockWidth, int64_t(high) * kBlockNodes<D> + inside, Order);
+      if (low >= 0)
+        visit(value + row * kRow, int64_t(low) * kBlockNodes<D> + inside, std::integral_constant<int, kBlockWidth>());
+      if (high >= 0)
+        visit(value + row * kRow + kBlockWidth, int64_t(high) * kBlockNodes<D> + inside,
+              std::integral_constant<int, Order>());
     }
   }
   void load_from(const T* nodes, const BaseBlock<T, D>& base_block) {
     clear();
-    for_runs(base_block, [&](T* tile, int64_t row, int n) {
-      for (int k = 0; k < n; k++) tile[k] = nodes[row + k];
-    });
+    for_runs(base_block, [&](T* tile, int64_t row, auto n) { __builtin_memcpy(tile, nodes + row, n * sizeof(T)); });
   }
   void add_to(T* nodes, const BaseBlock<T, D>& base_block) {
-    for_runs(base_block, [&](const T* tile, int64_t row, int n) {
-      for (int k = 0; k < n; k++) nodes[row + k] += tile[k];
+    for_runs(base_block, [&](const T* tile, int64_t row, auto n) {
+      T sums[n];
+      __builtin_memcpy(sums, nodes + row, sizeof(sums));
+      for (int k = 0; k < n; k++) sums[k] += tile[k];
+      __builtin_memcpy(nodes + row, sums, sizeof(sums));
     });
   }
 };
@@ -121,8 +128,8 @@ struct Conductors {
   alignas(64) T f[D][kLine], conductance[kLine];
   int number[kLine];
 
-  void set(const Topology<T, D>& t, const Field<const T>& x, const Field<const T>& of, const BaseBlock<T, D>& base_block,
-           const Chunk& chunk) {
+  void set(const Topology<T, D>& t, const Field<const T>& x, const Field<const T>& of,
+           const BaseBlock<T, D>& base_block, const Chunk& chunk) {
     constexpr int N = kWideLanes<T>;
     const bool direct = unit_stride(x, of);
     for (int i = 0; i < chunk.count; i++) number[i] = chunk.by_cell(i);
@@ -192,7 +199,8 @@ T sum_rows(const Chunk& chunk, const Conductors<Order, T, D>& particles, const i
   if (Sum == HeatSum::product) to_nodes<Order, D>(to);
   const auto filled = P(0) < of_cell;  // NaN at nodes stays out of cells without particles
   for (int k = 0; k < S; k++)          // outside, since the rows of consecutive k overlap
-    MPM_UNROLL for (int n = 0; n < kNodes / S; n++)
+      MPM_UNROLL
+    for (int n = 0; n < kNodes / S; n++)
       add_to_rows(select(filled, to[n * S + k], P(0)), to_row, Tile::offset(n / S, n % S, k));
   power = select(filled, power, P(0));
   T total = power[0];
@@ -208,14 +216,20 @@ MPM_HD void prefetch_rows(const Field<const T>& x, int components, const Chunk& 
     for (int a = 0; a < components; a++) __builtin_prefetch(row_of(x, a) + chunk.id[i] * x.stride[0], 0, 2);
 }
 
-// The rows of cells with particles of a chunk; returns their number.
+// The rows of cells with particles of a chunk, those with the fullest cells first, so that rows that are summed
+// together have about as many particles. Returns their number.
 template <int D>
 int rows_with_particles(const Chunk& chunk, int rows[kBlockNodes<D> / kBlockWidth]) {
-  int count = 0;
-  for (int row = 0, before = 0; row < kBlockNodes<D> / kBlockWidth; row++) {
-    const int end = chunk.cell_end[(row + 1) * kBlockWidth - 1];
-    if (end > before) rows[count++] = row;
-    before = end;
+  int most[kBlockNodes<D> / kBlockWidth], count = 0;
+  for (int cell = 0, before = 0; cell < kBlockNodes<D>; cell += kBlockWidth) {
+    int fullest = 0;
+    for (int i = cell; i < cell + kBlockWidth; before = chunk.cell_end[i++])
+      fullest = chunk.cell_end[i] - before > fullest ? chunk.cell_end[i] - before : fullest;
+    if (fullest == 0) continue;
+    int k = count++;
+    for (; k > 0 && most[k - 1] < fullest; k--) most[k] = most[k - 1], rows[k] = rows[k - 1];
+    most[k] = fullest;
+    rows[k] = cell / kBlockWidth;
   }
   return count;
 }

@@ -48,7 +48,8 @@ class Largest {
       if (!(value[l] - value[l] == T(0))) nan_.set(0, value[l] - value[l]);
     }
   }
-  // Raises the number of the scene. Numbers that are not negative have the order of their bits, and NaN is above all others.
+  // Raises the number of the scene. Numbers that are not negative have the order of their bits, and NaN is above all
+  // others.
   void raise(double* to) const {
     double most = 0;
     for (int l = 0; l < N; l++) {
@@ -70,8 +71,7 @@ class Largest {
 template <class T, int D, class G>
 MPM_HD Contribution<Pack<T, G::kSize>, D> heat_contribution(const HeatToNodesArguments<T, D>& a, const G& g, int scene,
                                                             const Pack<T, G::kSize> f[D],
-                                                            const Pack<T, G::kSize>& strain_rate,
-                                                            Largest<T>& largest) {
+                                                            const Pack<T, G::kSize>& strain_rate, Largest<T>& largest) {
   using P = Pack<T, G::kSize>;
   const P dt(time_step(a.scene_dt, a.dt, scene)), dx(a.topology.geometry.dx);
   HeatWeights<P> w = heat_weights(values_of(a.particles.volume, g), values_of(a.specific_heat, g, scene),

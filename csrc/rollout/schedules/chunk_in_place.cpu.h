@@ -96,8 +96,8 @@ struct ChunkInPlace {
         const GroupOfChunk g(order + i, end - i, count);
         Lanes<T> distance[D];
         MPM_UNROLL for (int a = 0; a < D; a++)
-          distance[a] = distance_in_cells(t.geometry, a, g.load(x.row[a] + begin),
-                                          Lanes<T>(T(base_block.corner[a] + base[a])));
+          distance[a] =
+              distance_in_cells(t.geometry, a, g.load(x.row[a] + begin), Lanes<T>(T(base_block.corner[a] + base[a])));
         f(g, i, base, distance);
       }
       i = cell_end[cell];

@@ -15,8 +15,8 @@ namespace {
 
 constexpr int kOrder = kOrderInPlace;
 
-// The work of a thread on the chunks of its base blocks. With `Heat`, G2P of the velocities precedes it, and G2P of heat
-// takes its place.
+// The work of a thread on the chunks of its base blocks. With `Heat`, G2P of the velocities precedes it, and G2P of
+// heat takes its place.
 template <bool Gradient, bool Heat, class T, int D>
 class ChunkPass {
  public:
@@ -111,19 +111,21 @@ class ChunkPass {
   // Sums of G2P for the particles that are in their base block.
   void gather(const BaseBlock<T, D>& base_block, const Chunk& next) {
     int prefetched = 0;
-    chunk_.for_groups(rows_.x_next, base_block, [&](const GroupOfChunk& g, int i, const int base[D], const Lanes<T> f[D]) {
-      if constexpr (Heat) {
-        heat_.gather(g, base, f);
-      } else {
-        const T* at = lines_.value + lines_.at(base);
-        // Most cells have one group: otherwise the compiler would store nodes for a second one on the stack.
-        asm volatile("" : "+r"(at));
-        Sums<Lanes<T>, D> s[D];
-        gather_lines<D, Gradient, T, D>(f, at, s);
-        g.template store_by<T>([&](const auto& store) { motion_.put_by(store, s); });
-      }
-      for (; prefetched <= i; prefetched += 64 / int(sizeof(T))) prefetch(next, prefetched);
-    });
+    chunk_.for_groups(rows_.x_next, base_block,
+                      [&](const GroupOfChunk& g, int i, const int base[D], const Lanes<T> f[D]) {
+                        if constexpr (Heat) {
+                          heat_.gather(g, base, f);
+                        } else {
+                          const T* at = lines_.value + lines_.at(base);
+                          // Most cells have one group: otherwise the compiler would store nodes for a second one on the
+                          // stack.
+                          asm volatile("" : "+r"(at));
+                          Sums<Lanes<T>, D> s[D];
+                          gather_lines<D, Gradient, T, D>(f, at, s);
+                          g.template store_by<T>([&](const auto& store) { motion_.put_by(store, s); });
+                        }
+                        for (; prefetched <= i; prefetched += 64 / int(sizeof(T))) prefetch(next, prefetched);
+                      });
   }
 
   // Prefetches the cache lines of the i-th particle of the next chunk. (GCC removes calls of functions that only

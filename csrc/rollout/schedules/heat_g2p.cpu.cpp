@@ -56,18 +56,19 @@ class HeatChunkPass {
 
   void gather(const BaseBlock<T, D>& base_block, const Chunk& next) {
     int prefetched = 0;
-    chunk_.for_groups(rows_.x_next, base_block, [&](const GroupOfChunk& g, int i, const int base[D], const Lanes<T> f[D]) {
-      const T* at = lines_.value + lines_.at(base);
-      asm volatile("" : "+r"(at));  // as in g2p2g.cpu.cpp
-      Sums<Lanes<T>, D> s[D];
-      gather_lines<D, false, T, D>(f, at, s);
-      g.template store_by<T>([&](const auto& store) {
-        motion_.put_by(store, s);
-        MPM_UNROLL for (int a = 0; a < D; a++)
-          store(f[a], distance_[a]);
-      });
-      for (; prefetched <= i; prefetched += 64 / int(sizeof(T))) prefetch(next, prefetched);
-    });
+    chunk_.for_groups(rows_.x_next, base_block,
+                      [&](const GroupOfChunk& g, int i, const int base[D], const Lanes<T> f[D]) {
+                        const T* at = lines_.value + lines_.at(base);
+                        asm volatile("" : "+r"(at));  // as in g2p2g.cpu.cpp
+                        Sums<Lanes<T>, D> s[D];
+                        gather_lines<D, false, T, D>(f, at, s);
+                        g.template store_by<T>([&](const auto& store) {
+                          motion_.put_by(store, s);
+                          MPM_UNROLL for (int a = 0; a < D; a++)
+                            store(f[a], distance_[a]);
+                        });
+                        for (; prefetched <= i; prefetched += 64 / int(sizeof(T))) prefetch(next, prefetched);
+                      });
   }
 
   // Prefetches the cache lines of the i-th particle of the next chunk.

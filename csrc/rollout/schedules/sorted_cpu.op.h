@@ -30,7 +30,8 @@ class SortedCpu {
   // heat, and G2P of heat is in the pass with the next P2G.
   static bool may_last(const SubstepsInputs& in) {
     return in.lattice.order() == 2 && in.n > kLeastLastingSteps && !in.lattice.deterministic() &&
-           (in.grows || in.resident) && in.flip() == 0 && (!HeatSteps<T, D>::wanted(in) || HeatSteps<T, D>::may_last(in));
+           (in.grows || in.resident) && in.flip() == 0 &&
+           (!HeatSteps<T, D>::wanted(in) || HeatSteps<T, D>::may_last(in));
   }
 
   // One substep, with `following` further ones; false as for `Substeps::activate`.
@@ -442,7 +443,7 @@ void SortedCpu<T, D>::pass(bool follows) {
     v.go(false);  // values of particles outside; those of others are not read before the last pass
     if (in_.wants_C) C.go(false);
     find_rows(false);
-    find_prefetched(false);
+    find_prefetched(heat.has_value());
     moved_ = true;
   }
   set_p2g();
