@@ -36,7 +36,9 @@ def shape_of(name, dim, **options):
     return mpm.Sphere((0.0,) * dim, 0.2, **options)
 
 
-def made(dim, device, dtype, joint="free", shape="sphere", kind="separate", friction=0.4, scenes=1, walls=None, pool=None):
+def made(
+    dim, device, dtype, joint="free", shape="sphere", kind="separate", friction=0.4, scenes=1, walls=None, pool=None
+):
     """A block of particles, and on it a body with the joint, of two parts, and a light free ball beside it that may
     share nodes with it; rows [B, 2, ...]."""
     grid = mpm.Grid(0.1, (0.0,) * dim, (2.0,) * dim, scenes=scenes, max_blocks=pool)
