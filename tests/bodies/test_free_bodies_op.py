@@ -36,10 +36,12 @@ def shape_of(name, dim, **options):
     return mpm.Sphere((0.0,) * dim, 0.2, **options)
 
 
-def made(dim, device, dtype, joint="free", shape="sphere", kind="separate", friction=0.4, scenes=1, walls=None):
+def made(
+    dim, device, dtype, joint="free", shape="sphere", kind="separate", friction=0.4, scenes=1, walls=None, pool=None
+):
     """A block of particles, and on it a body with the joint, of two parts, and a light free ball beside it that may
     share nodes with it; rows [B, 2, ...]."""
-    grid = mpm.Grid(0.1, (0.0,) * dim, (2.0,) * dim, scenes=scenes)
+    grid = mpm.Grid(0.1, (0.0,) * dim, (2.0,) * dim, scenes=scenes, max_blocks=pool)
     gravity = (0.5, -9.8, 0.3)[:dim]
     step = mpm.Step(grid, mpm.NeoHookean(E=1e4, nu=0.3), gravity, walls)
     low = (0.6, 0.6, 0.6) if walls is None else (0.0, 0.6, 0.6)
@@ -152,6 +154,25 @@ def test_momentum_of_body_and_nodes(dim, device):
         assert float(lost.abs().max()) > 1e-2
         torch.testing.assert_close(lost, gained, rtol=0, atol=1e-12)
         assert (float(report[0, 1:].max()) > 1e-6) == (most == 0)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_many_scenes(dim, device, dtype):
+    """Each of many scenes moves as one of few, of which CUDA has more threads for each."""
+    bodies, state, rows = made(dim, device, dtype, shape="box", scenes=2, walls="slip")
+    _, expected = bodies.advance(state, rows, 2, 2e-3)
+    times = 128
+    bodies, state, _ = made(dim, device, dtype, shape="box", scenes=2 * times, walls="slip")
+    _, after = bodies.advance(state, rows.repeat(times, 1, 1), 2, 2e-3)
+    bodies.check()
+    torch.testing.assert_close(after, expected.repeat(times, 1, 1), **OPTIONS[dtype])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_a_large_pool(device, dtype):
+    """A scene for which CUDA has the most threads."""
+    compare(*made(3, device, dtype, shape="box", kind="slip", walls="slip", pool=300))
 
 
 @pytest.mark.parametrize("kind", ["slip", "sticky"])
