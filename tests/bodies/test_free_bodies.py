@@ -281,6 +281,13 @@ def test_a_solve_that_has_not_converged_is_reported(monkeypatch):
         bodies.check()
 
 
+def test_thin_walls_of_bodies_are_reported():
+    step, _ = material(2)
+    walls = [mpm.Box((0.0, 0.0), (0.8, size)) for size in (0.4, 0.3)]
+    with pytest.warns(mpm.ThinWallWarning, match=r"obstacle 1 \(box\) is 3 dx thick"):
+        FreeBodies(step, [Body(wall, 10.0, 1.0) for wall in walls]).check()
+
+
 def test_what_has_no_derivative_is_an_error():
     """Second derivatives and torch.func; the bodies hold no graph after a step, and inference mode needs none."""
     step, state = material(2)

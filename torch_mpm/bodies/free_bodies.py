@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from ..boundaries.thickness import warn_of_thin_walls
 from ..cuda_graphs.capture import DeviceConstantCache, is_readable
 from ..errors import FLOATING, SimulationError, check_count, check_number, check_vector, shape_of
 from ..geometry.values import filled
@@ -193,11 +194,15 @@ class FreeBodies:
             raise ValueError("wrenches must be finite, got NaN or infinity")
 
     def check(self) -> None:
-        """Raise where a solution of the latest call has not converged.
+        """Raise where a solution of the latest call has not converged, and warn of thin walls of the bodies.
 
         Raises:
             SimulationError: it names the scene and the body. Momentum is conserved even so.
+
+        Warns:
+            ThinWallWarning: as `Step.check`; obstacles are numbered through all bodies.
         """
+        warn_of_thin_walls(self.obstacles, self.step.grid.dx)
         if self.report is not None and not bool(self.report.converged.all()):
             scene, body = (~self.report.converged).nonzero()[0].tolist()
             residual = float(self.report.residual[scene, body])
