@@ -52,7 +52,7 @@ struct OneThread {
                    slopes);
     }
     each_other(scene, [&](const BodyNode<T, D>& node, const T& mass, const Vector<T, D>& v) {
-      NodePush<T, D> push;
+      NodePush<T, D> push{};
       set_faces(a.contact, node, push);
       if (impulses) add_impulses(scene, node, mass, v, push, impulses);
       for (int by = 0; slopes && by < push.faces; by++)
@@ -159,6 +159,7 @@ void find_nodes(const FreeBodiesArguments<T, D>& a, const ContactArguments<T, D>
   poses += int64_t(scene) * a.contact.obstacles;
   const NearParts parts = near_parts(a.contact, poses, corner);
   std::optional<SlotPoses<T, D>> of_slot;
+  if (parts.near) nodes.lone.reserve(kBlockNodes<D>);
   for (int local = 0; local < kBlockNodes<D> && parts.near; local++) {
     if (!has_mass(a.contact, first + local)) continue;
     const NodeTouch<T, D> touch = touch_of_parts(a.contact, poses, parts, node_position(a.contact, corner, local));
