@@ -16,6 +16,7 @@ def scene(dim=3, dtype=torch.float64, scenes=1, law="neo_hookean", device="cpu",
     g = torch.Generator().manual_seed(5)
     melts, per_particle = options.pop("melts", False), options.pop("per_particle", False)
     of_grid = {"kernel": options.pop("kernel", "quadratic"), "deterministic": options.pop("deterministic", False)}
+    of_grid["max_blocks"] = options.pop("max_blocks", None)
     grid = mpm.Grid(0.1, (0.0,) * dim, (1.0,) * dim, scenes, **of_grid)
     points = mpm.seed.box((0.25,) * dim, (0.65,) * dim, grid, options.pop("per_cell", 2**dim), dtype=dtype)
     x = points.x[torch.randperm(len(points.x), generator=g)].repeat(scenes, 1)

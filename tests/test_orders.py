@@ -89,8 +89,8 @@ def test_particles_are_sorted_again(monkeypatch, dim, device, sorts):
 @torch.no_grad()
 @pytest.mark.parametrize("given", ["unsorted", "in an order of one's own"])
 def test_particles_with_heat_are_sorted_again(monkeypatch, given, dim, device, sorts):
-    """Also those that were given in an order; their ids come back."""
-    step, state = heat_scenes.scene(dim, melts=True, device=device)
+    """Also those that were given in an order, to which their ids and the parameters of each particle refer."""
+    step, state = heat_scenes.scene(dim, melts=True, per_particle=True, device=device)
     if given != "unsorted":
         state = state.replace(ids=torch.randperm(len(state)).to(device))
     monkeypatch.setattr(fused_op, "STEPS_WITH_HEAT", 5)

@@ -94,7 +94,7 @@ HEAT_UPDATE = 4 * (1 + D) + 2 * D + 2 * (MATRIX_VECTOR + D) + 2 * D
 
 # ---- kernels
 
-PRODUCTS = "theta product product capacity theta product product product"
+PRODUCTS = "theta capacity product product capacity product product product"
 """Values of the nodes of active blocks that the products of the STEPS read and write: H θ, and H d."""
 
 
@@ -137,9 +137,11 @@ KERNELS = (
         "updated sums sums",
         operations=gathered(D) + MOTION + STRAIN_RATE + DETERMINANT + 1 + HEAT_WEIGHTS + scattered(2, 2),
     ),
-    Kernel("averages of the nodes", ("HeatMeansArguments",), pool="sums theta capacity mean sums product product"),
     Kernel("products with H", ("product_kernel",), " ".join(["packed"] * STEPS), PRODUCTS, "", STEPS * applied()),
-    Kernel("increments of the nodes", ("HeatFinishArguments",), "", "capacity theta product product theta increment"),
+    Kernel(
+        "increments of the nodes", ("HeatFinishArguments",), "", "sums product product increment mean",
+        "sums product product product",
+    ),
     Kernel(
         "G2P of heat", ("HeatGather",), "index x C blend theta gradient theta gradient", "increment mean",
         operations=gathered(2) + HEAT_UPDATE,

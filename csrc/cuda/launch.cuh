@@ -41,10 +41,10 @@ unsigned grid_size(const Task& task, int64_t count) {
   return grid_size(count);
 }
 
-// Shared memory above 48 KB must be requested, and statically declared memory counts too: up to 16 KB.
+// Shared memory above 48 KB must be requested, and statically declared memory counts too: up to 22 KB.
 template <class Kernel>
 void allow_shared_memory(Kernel* kernel, size_t shared_memory) {
-  if (shared_memory > 32 * 1024)
+  if (shared_memory > 26 * 1024)
     check(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, int(shared_memory)));
 }
 

@@ -107,7 +107,7 @@ struct AdvanceItem {
                          const typename K::Motion::Result& sums) {
     const typename K::Written w = k.write(p, loaded, sums);
     follower.follow(topology(), m.scatter.base_block, active, w.x);
-    if (!(w.weights.number <= largest) && largest == largest) largest = w.weights.number;  // NaN stays
+    largest = larger_or_nan(largest, w.weights.number);
     store_particle<S, T, D>(shared, shared.row(i), f, w.of_nodes);
     PackedParticle<T, D>& q = m.packed[i];
 #pragma unroll
@@ -230,12 +230,17 @@ __global__ void __launch_bounds__(K::threads, K::resident) advance_kernel(const 
 
 template <int Order, class T, int D>
 void heat_advance(const HeatAdvanceArguments<T, D>& a, Stream stream) {
-  using Kernel = HeatAdvance<Order, T, D>;
   const Topology<T, D>& t = a.to_nodes.topology;
   const int64_t items = most_items(t.max_blocks, t.particles);
   if (items == 0) return;
-  launch_in_chain(advance_kernel<Kernel>, grid_size(items), Kernel::threads, Kernel::Shape::shared_bytes, stream,
-                  Kernel(a));
+  if constexpr (kAdvancesHeat<T, D>) {
+    using Kernel = HeatAdvance<Order, T, D>;
+    constexpr size_t dynamic = Kernel::Shape::shared_bytes;
+    static_assert(dynamic + sizeof(AdvanceMemory<Kernel>) <= 99 * 1024);
+    launch_in_chain(advance_kernel<Kernel>, grid_size(items), Kernel::threads, dynamic, stream, Kernel(a));
+  } else {
+    throw std::logic_error("G2P of the motion and P2G of heat have no kernel in float64 in 3-D");
+  }
 }
 
 MPM_INSTANTIATE_ORDERS(heat_advance, HeatAdvanceArguments)

@@ -200,7 +200,7 @@ MPM_HD void count_solve(const HeatCountArguments<T, D>& a, int64_t scene) {
   double* const row = a.status + scene * kHeatStatusSize;
   const double residual = double(a.residual[scene]);
   row[kUnsolved] += 1;
-  if (!(residual <= row[kLargestResidual])) row[kLargestResidual] = residual;
+  row[kLargestResidual] = larger_or_nan(row[kLargestResidual], residual);
 }
 
 }  // namespace TORCH_MPM_ISA

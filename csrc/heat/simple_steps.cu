@@ -3,9 +3,10 @@
 #include "heat/kernels.h"
 #include "heat/operator.cuh"
 
-// The simple steps of heat (csrc/heat/solve.h): a thread block packs the particles of an item, and then a warp sums the
-// products H u of an item. Unlike csrc/heat/heat.cu this needs no barriers of the whole grid, and particles may have
-// left their base block since the activation. Those are at the end of the packed particles of their item.
+// The simple steps of heat (csrc/heat/solve.h): a thread block packs the particles of an item, unless G2P has done
+// that, and then a warp sums the products H u of an item. Unlike csrc/heat/heat.cu this needs no barriers of the whole
+// grid, and particles may have left their base block since the activation. Those are at the end of the packed particles
+// of their item.
 namespace mpm::cuda {
 namespace {
 
@@ -258,10 +259,7 @@ void heat_simple_step(const HeatSimpleArguments<T, D>& a, Stream stream) {
   const int64_t items = most_items(a.solve.topology.max_blocks, a.solve.topology.particles);
   if (items == 0) return;
   if (!a.packed) launch_in_chain(pack_kernel<Order, T, D>, grid_size(items), kPackThreads, 0, stream, kernel);
-  // Few scenes need the last step. All blocks would cost time even so.
-  const unsigned blocks = grid_size(items * kernel.warps_of_item / (kProductThreads / 32) + 1);
-  const unsigned few_blocks = 2 * device_attribute(cudaDevAttrMultiProcessorCount);
-  launch_in_chain(product_kernel<Order, T, D>, a.step + 1 < kMostSimpleSteps ? blocks : std::min(blocks, few_blocks),
+  launch_in_chain(product_kernel<Order, T, D>, grid_size(items * kernel.warps_of_item / (kProductThreads / 32) + 1),
                   kProductThreads, 0, stream, kernel);
 }
 

@@ -86,6 +86,12 @@ struct HeatVectors {
   T* product;  // H p, zero between the iterations; H θ before the start
 };
 
+// The larger one of two numbers; NaN where one of them is NaN.
+template <class V>
+MPM_HD V larger_or_nan(const V& a, const V& b) {
+  return a == a && !(b <= a) ? b : a;
+}
+
 // Sums over nodes after a step.
 template <class V>
 struct StepSums {
@@ -116,8 +122,8 @@ struct StartSums : StepSums<V> {
     StepSums<V>::add(o);
     source += o.source;
     open += o.open;
-    if (!(o.bound <= bound)) bound = o.bound;  // NaN stays
-    if (!(o.spread <= spread)) spread = o.spread;
+    bound = larger_or_nan(bound, V(o.bound));
+    spread = larger_or_nan(spread, V(o.spread));
   }
 };
 
@@ -151,11 +157,11 @@ MPM_HD double simple_reduction(int steps, double c) {
   return steps == 1 ? c : steps == 2 ? 0.1715728752538099 * c * c : 0.038475772933681186 * c * c * c;
 }
 
-// ω of step k; μ = h (cos(π/(2 n)) − root).
+// ω of step k; μ = h (cos(π/(2 n)) − root) is a share of c. The order of the steps after the first one does not matter.
 template <class T>
 MPM_HD T simple_weight(int steps, int k, const T& c) {
-  const double root = k == 0 ? 0 : steps == 2 ? 0.8284271247461901 : k == 1 ? 0.9282032302755092 : 0.46410161513775455;
-  return T(1) / (T(1) + T(root) * c);
+  const double share = k == 0 ? 0 : steps == 2 ? 0.8284271247461901 : k == 1 ? 0.9282032302755092 : 0.46410161513775455;
+  return T(1) / (T(1) + T(share) * c);
 }
 
 // Those for a bound c and a tolerance of the residual.

@@ -53,6 +53,11 @@ struct HeatToNodesArguments {
   NodeField<T> sums;                    // kHeatChannels, zero on entry
 };
 
+// Whether G2P of the motion and P2G of heat may be one kernel: in float64 in 3-D its shared memory would exceed the
+// 99 KB of many devices.
+template <class T, int D>
+constexpr bool kAdvancesHeat = sizeof(T) == sizeof(float) || D == 2;
+
 // G2P of the motion and P2G of heat in one pass over the particles, on CUDA. It also stores the volumes after the step,
 // and packs the particles for the products of the simple steps where there is a work space.
 template <class T, int D>
@@ -101,11 +106,10 @@ struct HeatToParticlesArguments {
   Field<const T> x, velocity_gradient, blend, number;
   HeatParticles<T> particles;
   HeatValue<T> specific_heat, melting_point, latent_heat;
-  HeatTransfer transfer = HeatTransfer::hybrid;
   Field<const T> scene_dt;
   double dt = 0, moment_scale = 1;
   NodeField<const T> nodes;          // the sums from kHeatTheta on: increment and θ̄
-  Field<T> theta, gradient, liquid;  // results, in other memory than the inputs
+  Field<T> theta, gradient, liquid;  // results, on CUDA in other memory than the inputs
   double* largest = nullptr;  // column [scenes] of the status, raised to the largest diffusion number of a particle
                               // whose liquid fraction changes
 };

@@ -17,7 +17,7 @@ template <class T, int D>
 struct HeatSolution {
   HeatToNodesArguments<T, D> down;
   HeatArguments<T, D> system;
-  const T* theta;  // averages of the nodes [N]
+  const T* theta;  // averages of the nodes [N]; null where the solve reads their sums
 };
 
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda
@@ -56,6 +56,9 @@ class HeatSteps {
   bool heats_by_laws() const { return dissipated_ >= 0; }
   Field<T> dissipated() { return column(fields.next(false), dissipated_); }
 
+  // Steps leave nothing for an adjoint: neither increments nor averages of the nodes.
+  void leave_no_record() { for_record_ = false; }
+
   // Whether begin() is needed: G2P has not stored the present volumes, or laws store what they dissipate.
   bool begins() const { return !has_volumes_ || heats_by_laws(); }
 
@@ -75,7 +78,7 @@ class HeatSteps {
   // activations last. Sums on deterministic grids have an order.
   void join_g2p(const Field<const T>& x, const Field<const T>& mass, const Field<const T>& velocity_gradient,
                 backend::Stream stream) {
-    if (!s_.displacements.defined() || in_.lattice.deterministic()) return;
+    if (!kAdvancesHeat<T, D> || !s_.displacements.defined() || in_.lattice.deterministic()) return;
     HeatAdvanceArguments<T, D>& a = s_.with_heat;
     a.to_nodes = begin_nodes(x, mass, velocity_gradient, stream);
     a.rest = s_.p2g.volume;
@@ -105,12 +108,13 @@ class HeatSteps {
     return conduct(down, rest, scene, stream, known);
   }
 
-  // The transfer to the nodes, whose sums are zero; then the rest of that part.
+  // The transfer to the nodes, whose sums are zero.
   HeatToNodesArguments<T, D> begin_nodes(const Field<const T>& x, const Field<const T>& mass,
                                          const Field<const T>& velocity_gradient, backend::Stream stream) {
     make_nodes(stream);
     return to_nodes(x, mass, velocity_gradient);
   }
+  // That part after the transfer to the nodes.
   HeatSolution<T, D> conduct(const HeatToNodesArguments<T, D>& down, const Field<const T>& rest,
                              const Field<const int>& scene, backend::Stream stream, const T* known = nullptr) {
     const Field<const T>& x = down.x;
@@ -124,7 +128,7 @@ class HeatSteps {
       solve_by_simple_steps(a, stream);
     else
       solve(a, stream);
-    return {down, a, static_cast<const T*>(theta_.data_ptr())};
+    return {down, a, averages()};
   }
 
   // The transfer of these temperatures to the particles, to the other buffer of the fields or in place.
@@ -182,9 +186,10 @@ class HeatSteps {
   // Whether scenes of few simple steps have kernels of their own. Sums on deterministic grids have an order.
   bool takes_simple_steps() const { return MPM_BACKEND == MPM_BACKEND_IS_cuda && !in_.lattice.deterministic(); }
   // Whether the solve reads the sums of the nodes. Boundaries and the adjoint need averages in arrays.
-  bool solves_for_sums() const { return takes_simple_steps() && in_.resident && !exchanges() && held_nodes() == 0; }
+  bool solves_for_sums() const { return takes_simple_steps() && !for_record_ && !exchanges() && held_nodes() == 0; }
   // Whether G2P packs the particles for the simple steps; a held surface changes their conductance after it.
   bool packs_in_g2p() const { return takes_simple_steps() && !holds_surface(); }
+  const T* averages() const { return theta_.defined() ? static_cast<const T*>(theta_.data_ptr()) : nullptr; }
   double* rows_of_status() const { return static_cast<double*>(status.data_ptr()); }
   const T* held_temperature(int64_t k) const { return temperatures_.pointer + k * temperatures_.stride[0]; }
 
@@ -225,7 +230,7 @@ class HeatSteps {
   std::vector<HeatValue<T>> values_;  // of the parameters; those per particle have no pointer
   std::vector<int> own_;              // index in `parameters`, or -1
   Tensor conductance_, blend_, number_;
-  bool has_volumes_ = false;
+  bool has_volumes_ = false, for_record_ = true;
   Field<const T> temperatures_;   // of the held obstacles [K, B]
   Tensor exchange_of_particles_;  // with the held surface
   Tensor start_, fixed_;
@@ -410,8 +415,7 @@ void HeatSteps<T, D>::make_nodes(backend::Stream stream) {
   const int64_t slots = s_.activation.slots(), nodes = slots * kBlockNodes<D>;
   if (slots != slots_) {
     slots_ = slots;
-    theta_ = empty(in_.x, {nodes});
-    capacity_ = empty(in_.x, {nodes});
+    if (!solves_for_sums()) theta_ = empty(in_.x, {nodes}), capacity_ = empty(in_.x, {nodes});
     increment_ = empty(in_.x, {nodes});
     if (held_nodes() > 0) start_ = empty(in_.x, {nodes}), fixed_ = empty(in_.x, {nodes}, ScalarType::Bool);
     workspace_ = Tensor();
@@ -647,9 +651,9 @@ void HeatSteps<T, D>::solve_by_simple_steps([[maybe_unused]] HeatArguments<T, D>
   finish.simple.solve = a;
   finish.simple.packed = s_.with_heat.workspace != nullptr;
   std::copy(std::begin(product_), std::end(product_), finish.simple.product);
-  finish.theta = field<const T>(theta_).pointer;
+  finish.theta = averages();
   finish.sums = sums_;
-  if (!in_.resident) finish.increment = a.increment;
+  if (for_record_) finish.increment = a.increment;
   if (solves_for_sums()) finish.cleared = next_cleared();
   finish.status = rows_of_status();
   finish.displacement = s_.advance.displacement;

@@ -100,7 +100,7 @@ constexpr int64_t kMostPathBytes = 1 << 26;  // of a call, for obstacles on path
 constexpr int64_t kLeastSortedSteps = 64, kLeastSortedParticles = 1 << 15;
 
 // The same for particles with heat in any order, which they lose while the steps of a long call move them
-// (`STEPS_IN_ORDER` in torch_mpm/rollouts/sorting.py): on an H200 a step of 8M particles takes a fifth longer after 80
+// (`STEPS_WITH_HEAT` in torch_mpm/rollouts/sorting.py): on an H200 a step of 8M particles takes a fifth longer after 80
 // of them, and sorting as long as two.
 constexpr int64_t kLeastHeatedSteps = 128, kLeastHeatedParticles = 1 << 18;
 

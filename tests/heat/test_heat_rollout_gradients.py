@@ -545,3 +545,17 @@ def test_raw_ops(law, device):
     torch.library.opcheck(torch.ops.torch_mpm.substeps_backward.default, adjoint, test_utils=checks)
     with pytest.raises(RuntimeError, match="grad_heat must have shape"):
         torch.ops.torch_mpm.substeps_backward([*grads[:7], grads[7][:, 1:]], *adjoint[1:])
+
+
+def test_leaves_in_place_of_arguments(dim, device):
+    """Of the op itself, whose other arguments were made where nothing needed gradients (docs/training.md)."""
+    step, state = scene(dim, device=device)
+    ends = []
+    arguments = mpm.substeps_arguments(step, state, 4, DT)
+    v = state.v.clone().requires_grad_()
+    results = torch.ops.torch_mpm.substeps(**arguments | {"v": v})
+    ends.append(torch.autograd.grad(results[0].square().sum() + results[10][:, 0].square().sum(), v)[0])
+    v = state.v.clone().requires_grad_()
+    end = composed(step, state.replace(v=v), 4, DT)
+    ends.append(torch.autograd.grad(end.x.square().sum() + end.temperature.square().sum(), v)[0])
+    torch.testing.assert_close(*ends, rtol=1e-9, atol=1e-9 * float(ends[1].abs().max()))

@@ -27,7 +27,7 @@ from .facts import differentiates, follows_paths
 from .fused_heat import heat_arguments, heat_changes
 from .plan import SCHEDULES, RolloutPlan
 from .reasons import why_not_fused
-from .sorting import STEPS_IN_ORDER, STEPS_WITH_HEAT, restore_order, sort_particles, without_ids
+from .sorting import STEPS_IN_ORDER, STEPS_WITH_HEAT, restore_order, sort_particles
 from .steps import MovingBodies, Steps
 
 
@@ -62,8 +62,7 @@ def _in_order(steps: Steps, state: State, plan: RolloutPlan) -> State:
     order at the end."""
     step, n = steps.step, steps.n
     assert plan.facts is not None and isinstance(step, Step)
-    given = step.prepare(state)
-    end = without_ids(given)
+    end = given = step.prepare(state)
     most = n if plan.facts.gradients else STEPS_IN_ORDER if step.heat is None else STEPS_WITH_HEAT
     plan = plan.of_sorted()
     for first in range(0, n, most):

@@ -40,7 +40,7 @@ class CallPlan(NamedTuple):
     steps: int
     """Largest number of steps of the call."""
     order: int
-    """Order of unsorted particles: 0 as given; 1 sorted before the call and restored after it; 2 sorted by the schedule
+    """Order of the particles: 0 as given; 1 sorted before the call and restored after it; 2 sorted by the schedule
     itself."""
     reasons: tuple[tuple[str, str], ...]
     """Why each other schedule was not chosen."""

@@ -11,9 +11,10 @@ from ..laws import Mixture
 from ..state.state import PARTICLE_FIELDS, State, _take_all
 from ..step.step import Step
 
-STEPS_IN_ORDER, STEPS_WITH_HEAT = 1024, 64
-"""Numbers of steps after which particles are sorted again, without heat and with it: the op keeps those without heat in
-the order of its blocks."""
+STEPS_IN_ORDER = 1024
+"""Number of steps after which particles are sorted again."""
+STEPS_WITH_HEAT = 64
+"""The same with heat, where more kernels read the particles in the order of the blocks."""
 
 
 def sort_particles(step: Step, state: State) -> State:
@@ -21,11 +22,6 @@ def sort_particles(step: Step, state: State) -> State:
     if isinstance(step.law, Mixture):
         step.law.check_material(state)
     return step.sorted(state)
-
-
-def without_ids(state: State) -> State:
-    """The state without the ids of an earlier order, so that those of `sort_particles` refer to the present one."""
-    return state if state.ids is None else state.replace(ids=None)
 
 
 def restore_order(step: Step, end: State, start: State, given: State) -> State:
@@ -38,6 +34,8 @@ def restore_order(step: Step, end: State, start: State, given: State) -> State:
     found = {name: own.get(name) for name in _tensors(end)}  # Those of fields that steps do not change remain.
     moved = {name: t for name, t in _tensors(end).items() if t is not None and t is not before.get(name)}
     place = torch.empty_like(ids).scatter_(0, ids, torch.arange(len(ids), device=ids.device))
+    if given.ids is not None:  # They refer to the order before an earlier sort.
+        place = place.index_select(0, given.ids)
     found |= dict(zip(moved, _take_all(list(moved.values()), place), strict=True))
     extra: dict[str, Any] = {name: found.pop((name,)) for (name,) in [k for k in found if isinstance(k, tuple)]}
     return end.replace(**found, extra=extra)

@@ -20,7 +20,7 @@ from .fused_op import in_calls
 from .graph_replay import CHUNK, replay_all
 from .plan import RolloutPlan, check_plan, plan_call, plan_of_steps
 from .run import rollout
-from .sorting import restore_order, sort_particles, without_ids
+from .sorting import restore_order, sort_particles
 from .steps import Steps
 
 SEGMENT = 16
@@ -117,7 +117,7 @@ def rollout_to(
     options = {"checkpoint": checkpoint, "schedule": schedule} if plan is None else {"plan": plan}
     given = _compensated(step, step.prepare(state), cfl, longest)
     unsorted = plan_call(None, facts_of(Steps(step, 1, 1.0), given)._replace(steps=most)).order > 0
-    start = sort_particles(step, without_ids(given)) if unsorted else given
+    start = sort_particles(step, given) if unsorted else given
     clocks = Clocks(step, start, time, cfl, longest, most, previous)
     with (
         step._error_status.call(state) as end_call,

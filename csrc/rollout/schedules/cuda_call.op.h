@@ -33,7 +33,7 @@ class CudaCall {
     s_.facts.captured = is_captured(stream_);
     s_.facts.graph_loops = !loops_are_refused;
     schedule_ = schedule_of(in_.schedule, s_.facts);
-    if (HeatSteps<T, D>::wanted(in_)) heat_.emplace(s_);
+    if (HeatSteps<T, D>::wanted(in_)) heat_.emplace(s_), heat_->leave_no_record();
     if (ThermalLaws<T, D>::wanted(s_)) thermal_.emplace(s_, heat_ ? &*heat_ : nullptr);
     s_.laws_are_apart = thermal_ || (heat_ && heat_->heats_by_laws());
   }
