@@ -2,17 +2,21 @@
 
     python -m benchmarks.speed.bodies [--device cuda]      # a minute
     python -m benchmarks.speed.bodies --quick              # seconds
+    python -m benchmarks.speed.bodies --out DIRECTORY
 
 Balls: two balls on an elastic block in 3-D, one scene. Vessels: 735 particles of water in each scene, in a cup that
 swings on a hinge, and beside it a glass that slides, both of three boxes, in 2-D; as obstacles at rest ("obstacles"),
-and as bodies. Steps are those of one call, by the wall clock, with one wait for the device at the end. "Tracked" are
-steps whose gradient is wanted, forward only.
+and as bodies. Steps are those of one call, by the wall clock, with one wait for the device at the end. Steps without
+bodies have the fastest schedule, and beside it the schedule of those with bodies, `per_step`. "Tracked" are steps
+whose gradient is wanted, forward only.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -78,10 +82,12 @@ def times(
     clock: Clock,
     tracks: bool,
 ) -> list[object]:
-    """A row of the table: ms per step without bodies, with them, their share, and ms with a graph."""
+    """A row of the table: ms per step without bodies, without them by `per_step`, and with them; the share of the
+    bodies, beside both; and ms with a graph."""
     step, state, bodies, rows = made
     with torch.no_grad(), clock:
         without = clock.steps(lambda: mpm.rollout(step, state, n, dt), n).fastest_ms
+        alike = clock.steps(lambda: mpm.rollout(step, state, n, dt, schedule="per_step"), n).fastest_ms
         own = clock.steps(lambda: bodies.advance(state, rows, n, dt), n).fastest_ms
         bodies.check()
         step.check(mpm.rollout(step, state, n, dt))
@@ -89,7 +95,19 @@ def times(
     few = 5
     slow = clock.steps(lambda: bodies.advance(state, given, few, dt), few).fastest_ms if tracks else None
     dtype = str(state.x.dtype).removeprefix("torch.")
-    return [name, len(rows), len(state), dtype, without, own, f"{100 * (own / without - 1):.0f}", slow]
+    shares = [f"{100 * (own / ms - 1):.0f}" for ms in (without, alike)]
+    return [name, len(rows), len(state), dtype, without, alike, own, *shares, slow]
+
+
+HEADER = (
+    "case", "scenes", "particles", "dtype", "without [ms]", "per_step [ms]", "with bodies [ms]", "bodies [%]",
+    "of per_step [%]", "tracked [ms]",
+)  # fmt: skip
+
+
+def text(result: dict[str, Any]) -> str:
+    place, table = common.describe(result["environment"]), common.table(HEADER, result["rows"])
+    return f"# Steps with free bodies\n\n{place}\n\n{table}\n"
 
 
 def main() -> None:
@@ -97,6 +115,7 @@ def main() -> None:
     parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
     parser.add_argument("--quick", action="store_true", help="few scenes and steps, to see that it works")
     parser.add_argument("--scenes", type=int, nargs="*", help="numbers of scenes of vessels")
+    parser.add_argument("--out", type=Path, default=common.RESULTS)
     arguments = parser.parse_args()
     cuda = arguments.device == "cuda"
     scenes = arguments.scenes or ([1, 4] if arguments.quick else [1, 64, 2048] if cuda else [1, 16])
@@ -109,9 +128,9 @@ def main() -> None:
             made = vessels(count, dtype, arguments.device)
             rows.append(times("vessels", made, n, 1e-4, clock, tracks=count * 735 < 20000))
             common.release_memory()
-    print(common.describe(common.environment(arguments.device)))
-    header = ("case", "scenes", "particles", "dtype", "without [ms]", "with bodies [ms]", "bodies [%]", "tracked [ms]")
-    print(common.table(header, rows))
+    result = {"environment": common.environment(arguments.device), "rows": rows}
+    print(text(result))
+    common.write(arguments.out, f"bodies_{common.slug(result['environment']['device'])}", result, text(result))
 
 
 if __name__ == "__main__":

@@ -31,6 +31,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -229,6 +230,11 @@ def _newton_solver(model: Any, worlds: int, device: str, rigid: str) -> Any:
     )
 
 
+def text(result: dict[str, Any]) -> str:
+    figures = "{of}: {worlds} worlds, {ms:.4g} ms per step of all, {rate:.4g} steps/s, then {found}".format(**result)
+    return f"# Cup and glass beside Newton\n\n{common.describe(result['environment'])}\n\n{figures}\n"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--of", choices=["torch_mpm", "newton"], required=True)
@@ -237,6 +243,7 @@ def main() -> None:
     rigid = "mujoco" if find_spec("mujoco_warp") else "xpbd"
     parser.add_argument("--rigid", choices=["mujoco", "xpbd"], default=rigid, help="rigid solver of Newton")
     parser.add_argument("--steps", type=int, default=20, help="environment steps of a measurement")
+    parser.add_argument("--out", type=Path, default=common.RESULTS)
     arguments = parser.parse_args()
     cuda = arguments.device == "cuda"
     worlds = arguments.worlds or (2048 if cuda else 2)
@@ -256,12 +263,17 @@ def main() -> None:
     timed()
     print(f"{time.perf_counter() - begin:.0f} s to prepare, then {found()}")
     seconds = min(timed() for _ in range(3))
-    print(common.describe(common.environment(arguments.device)))
-    rate = worlds * arguments.steps / seconds
-    print(
-        f"{arguments.of}: {worlds} worlds, {1e3 * seconds / arguments.steps:.4g} ms per step of all, {rate:.4g} steps/s"
-    )
-    print(f"after {4 * arguments.steps} steps: {found()}")
+    environment = common.environment(arguments.device)
+    result = {
+        "environment": environment,
+        "of": arguments.of,
+        "worlds": worlds,
+        "ms": 1e3 * seconds / arguments.steps,
+        "rate": worlds * arguments.steps / seconds,
+        "found": found(),
+    }
+    print(text(result))
+    common.write(arguments.out, f"bodies_{arguments.of}_{common.slug(environment['device'])}", result, text(result))
 
 
 if __name__ == "__main__":
