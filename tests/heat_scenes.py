@@ -106,6 +106,9 @@ THERMAL = {
     "wax": lambda: mpm.ThermalExpansion(
         mpm.Melting(mpm.NeoHookean(E=SOFTENING, nu=0.3), mpm.WeaklyCompressible(**WATER), 0.5), 1e-3
     ),
+    "viscoelastic wax": lambda: mpm.ThermalExpansion(
+        mpm.Melting(named("viscoelastic")["viscoelastic"](), mpm.WeaklyCompressible(**WATER), 0.5), 1e-3
+    ),
 }
 
 

@@ -398,6 +398,7 @@ void SubstepsBackward<T, D>::backward_laws(Adjoints& adjoints, const Tensor& dis
   }
   if (F_term_.defined() || parameters_term_.defined())
     add_terms({{adjoints.F, F_term_}, {adjoints.parameters, parameters_term_}});
+  if (thermal_ && thermal_->F_term.defined()) add_terms({{thermal_->elastic_F, thermal_->F_term}});
 }
 
 // Sets an adjoint to the given gradient, or to zero.

@@ -119,14 +119,16 @@ MPM_HD void end_laws_of(const ThermalLawsArguments<T, D>& a, int64_t p) {
   if (changes_F(a, at)) store_matrix<D>(at, a.next_F, factor * load_matrix<D>(at, constant(a.elastic_F)));
   if (a.next_J.pointer)
     store_scalar(at, a.next_J, volume_of_stretch<D>(factor) * load_scalar(at, constant(a.elastic_J)));
-  if (fraction == T(0) && !flows && !a.difference.pointer) return;
+  const bool is_solid = fraction == T(0) && !flows;
+  if (is_solid && !a.difference.pointer) return;
   const Matrix<T, D> solid = load_matrix<D>(at, constant(a.stress)), liquid = load_matrix<D>(at, a.liquid_stress);
+  if (a.difference.pointer) store_matrix<D>(at, a.difference, liquid - solid);
+  if (is_solid) return;
   Matrix<T, D> stress;
   MPM_UNROLL for (int i = 0; i < D; i++) MPM_UNROLL
     for (int j = 0; j < D; j++)
       stress[i][j] = stress_of_phases(solid[i][j], liquid[i][j], fraction, a.coherency.value[0]);
   store_matrix<D>(at, a.stress, stress);
-  if (a.difference.pointer) store_matrix<D>(at, a.difference, liquid - solid);
   if (a.dissipated.pointer && flows) store_scalar(at, a.dissipated, T(0));
 }
 

@@ -9,6 +9,7 @@ from helpers import relative_error
 import torch_mpm as mpm
 from benchmarks.catalogue import scenes
 from torch_mpm.laws.parameters import evaluate
+from torch_mpm.laws.thermal_calls import tables_of_expansion
 
 KNOTS, VALUES = [0.0, 10.0, 50.0], [2e4, 1e4, 1e3]
 
@@ -42,6 +43,20 @@ def test_table_interpolates_and_stays_constant_beyond_its_ends(device):
     expected = np.interp(theta.cpu(), KNOTS, VALUES)
     np.testing.assert_allclose(table(theta).cpu(), expected, rtol=1e-14)
     assert table(theta.float()).dtype == torch.float32
+
+
+def test_the_lists_of_a_table_follow_its_tensor(device):
+    given = torch.tensor(KNOTS, dtype=torch.float64, device=device)
+    for table in (mpm.Table(KNOTS, given.float()), mpm.Table(given, VALUES)):
+        assert table.temperature.device == table.value.device == given.device
+
+
+def test_an_expansion_by_a_table_follows_the_particles():
+    """Values may be assigned on another device than that of the temperatures; meta stands for it."""
+    table, x = mpm.Table(KNOTS, VALUES), torch.empty(5, 3, device="meta")
+    table.value = torch.empty(3, device="meta")
+    ((_, rows),) = tables_of_expansion(table, x)
+    assert rows.device == x.device and rows.shape == (2, 3)
 
 
 def test_table_is_differentiable():

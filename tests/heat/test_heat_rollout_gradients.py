@@ -9,6 +9,7 @@ from heat_scenes import DT, LAWS, THERMAL, TRANSFERS, bodies, composed, held, sc
 from pairs import in_pairs
 
 import torch_mpm as mpm
+from benchmarks.catalogue.laws import named
 from torch_mpm import heat_boundaries
 from torch_mpm.laws.parameters import PerMaterial
 from torch_mpm.rollouts import plan_rollout
@@ -17,7 +18,8 @@ from torch_mpm.rollouts.budget import bytes_of_a_substep
 F64 = torch.float64
 STATE = ("x", "v", "C", "F", "J", "mass", "volume", "temperature")
 ALL = (*STATE, "extra")
-MIXTURE = ["expansion", "wax", "two tables", "expanding fluid", "melting and flow", "neo_hookean", "fluid"]
+MIXTURE = ["expansion", "wax", "two tables", "expanding fluid", "melting and flow", "viscoelastic wax"]
+MIXTURE += ["neo_hookean", "fluid", "viscoelastic"]
 TEMPERED = (*THERMAL, "mixture by temperature")
 OF_DIFFERENCES = ("expansion", "wax")
 PARAMETERS = ("conductivity", "specific_heat", "melting_point", "latent_heat")
@@ -426,6 +428,19 @@ def test_plastic_heating(dim, name, with_source, device):
     step.heat.plastic_heating = 0.0
     without = gradients(mpm.rollout, step, melting(state), 4, DT, of)
     assert float((found["v"] - without["v"]).abs().max()) > 1e-6 * float(found["v"].abs().max())
+
+
+def test_a_collapse_passes_the_gradient_of_F_to_J(dim, device):
+    """F after a collapse is J^(1/D) 1, whose derivative is dJ 1 / D at J = 1; the viscoelastic solid has history."""
+    law = mpm.Melting(named("viscoelastic")["viscoelastic"](), mpm.WeaklyCompressible(1e5), 0.5)
+    step, state = tempered("wax", dim, device=device)
+    step.law = law
+    start = step.prepare(state.replace(F=None, J=None, extra={"liquid": torch.ones_like(state.mass)}))
+    start = start.replace(v=torch.zeros_like(state.v), J=start.J.clone().requires_grad_())
+    for run in (mpm.rollout, composed):
+        end = run(step, start, 1, 1e-9)
+        (grad,) = torch.autograd.grad(end.F.diagonal(dim1=1, dim2=2).sum(), start.J)
+        torch.testing.assert_close(grad, torch.ones_like(grad), rtol=1e-4, atol=0)
 
 
 @pytest.mark.parametrize(

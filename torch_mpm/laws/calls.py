@@ -100,7 +100,7 @@ def _add_phases(calls: LawCalls, law: Material, state: Any, dt: float | Tensor |
 
     name = _add(calls, solid, state, dt)
     add_tables(tables_of_parameters(solid, state.x))
-    add_tables(tables_of_expansion(phases.expansion))
+    add_tables(tables_of_expansion(phases.expansion, state.x))
     calls.history_names.append(solid.history_names())
     if liquid is not None:
         name += f"~{_add(calls, liquid, state, dt)}"

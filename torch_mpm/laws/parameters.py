@@ -43,6 +43,8 @@ def check_knots(name: str, knots: Tensor, of_values: str, values: Tensor) -> Non
 class Table(nn.Module):
     """Piecewise linear function of temperature, constant beyond its ends; differentiable by temperature and values.
 
+    Its temperatures are on the device of its values. Lists follow a tensor, so that steps need no copies from the host.
+
     Args:
         temperature: at least two increasing numbers [K], relative to the reference of the simulation.
         value: as many numbers, or a tensor [K] that may require grad.
@@ -66,6 +68,10 @@ class Table(nn.Module):
                 "temperature and value of a table must be lists of one length, 2 or more, "
                 f"got {shape_of(knots)} and {shape_of(values)}"
             )
+        if isinstance(value, Tensor):
+            knots = knots.to(values.device)
+        else:
+            values = values.to(knots.device)
         check_knots("temperature of a table", knots, "value of a table", values)
         self._kept = DeviceConstantCache()
         store(self, "temperature", knots)

@@ -58,12 +58,13 @@ Tables = list[tuple[int, Tensor]]
 """Numbers of parameters, `EXPANSION` or `COHERENCY`, with knots and values [2, K]."""
 
 
-def tables_of_expansion(coefficient: Any) -> Tables | None:
-    """The table of an expansion; None where it is neither one number nor a `Table`."""
+def tables_of_expansion(coefficient: Any, x: Tensor) -> Tables | None:
+    """The table of an expansion, on the device of x; None where it is neither one number nor a `Table`."""
     if coefficient is None:
         return []
     if type(coefficient) is Table:
-        return [(EXPANSION, torch.stack([coefficient.temperature.double(), coefficient.value.double()]))]
+        rows = [t.to(x.device, torch.float64) for t in (coefficient.temperature, coefficient.value)]
+        return [(EXPANSION, torch.stack(rows))]
     if callable(coefficient) and not isinstance(coefficient, Tensor):
         return None
     number = torch.as_tensor(coefficient, dtype=torch.float64)
@@ -118,7 +119,7 @@ def why_not_thermal(law: Material, x: Tensor, melts: bool) -> str | None:
     phases = phases_of(law)
     if phases.liquid is not None and not melts:
         return "a law melts, and the heat has no melting point"
-    if tables_of_expansion(phases.expansion) is None:
+    if tables_of_expansion(phases.expansion, x) is None:
         return "an expansion is neither one number nor a table"
     if any([tables_of_parameters(part, x) is None for part in laws_in(law)]):  # type: ignore[arg-type]
         return "a parameter of the law is a function, and its heat changes the temperature"
