@@ -505,8 +505,11 @@ HeatToParticlesArguments<T, D> HeatSteps<T, D>::to_particles(const HeatToNodesAr
 
 template <class T, int D>
 void HeatSteps<T, D>::means(backend::Stream stream) {
-  HeatMeansArguments<T, D> a{used_slots() * kBlockNodes<D>, sums_, static_cast<T*>(theta_.data_ptr()),
-                             static_cast<T*>(capacity_.data_ptr())};
+  HeatMeansArguments<T, D> a;
+  a.nodes = used_slots() * kBlockNodes<D>;
+  a.sums = sums_;
+  a.theta = static_cast<T*>(theta_.data_ptr());
+  a.capacity = static_cast<T*>(capacity_.data_ptr());
   if (held_nodes() > 0) {
     a.start = static_cast<T*>(start_.data_ptr());
     a.fixed = static_cast<bool*>(fixed_.data_ptr());
