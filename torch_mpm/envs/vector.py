@@ -283,7 +283,8 @@ class MaterialEnv(gymnasium.vector.VectorEnv):
 
         Raises:
             TypeError, ValueError: for other actions, for ones that require a gradient where the environment is not
-                differentiable, and on the CPU for ones that are not finite; on CUDA their scenes fail.
+                differentiable, and on the CPU for ones that are not finite; on CUDA their scenes fail, and the reason
+                is that particles are not finite.
             RuntimeError: before the first reset.
         """
         if not self._began:
