@@ -284,8 +284,9 @@ def test_a_solve_that_has_not_converged_is_reported(monkeypatch):
 def test_thin_walls_of_bodies_are_reported():
     step, _ = material(2)
     walls = [mpm.Box((0.0, 0.0), (0.8, size)) for size in (0.4, 0.3)]
-    with pytest.warns(mpm.ThinWallWarning, match=r"obstacle 1 \(box\) is 3 dx thick"):
+    with pytest.warns(mpm.ThinWallWarning, match=r"obstacle 1 \(box\) is 3 dx thick") as found:
         FreeBodies(step, [Body(wall, 10.0, 1.0) for wall in walls]).check()
+    assert found[0].filename == __file__
 
 
 def test_what_has_no_derivative_is_an_error():
