@@ -231,7 +231,11 @@ def _newton_solver(model: Any, worlds: int, device: str, rigid: str) -> Any:
 
 
 def text(result: dict[str, Any]) -> str:
-    figures = "{of}: {worlds} worlds, {ms:.4g} ms per step of all, {rate:.4g} steps/s, then {found}".format(**result)
+    figures = (
+        "{of}: {worlds} worlds, {ms:.4g} ms per step of all, {rate:.4g} steps/s, after {steps} steps {found}".format(
+            **result
+        )
+    )
     return f"# Cup and glass beside Newton\n\n{common.describe(result['environment'])}\n\n{figures}\n"
 
 
@@ -270,6 +274,7 @@ def main() -> None:
         "worlds": worlds,
         "ms": 1e3 * seconds / arguments.steps,
         "rate": worlds * arguments.steps / seconds,
+        "steps": 4 * arguments.steps + int(cuda and arguments.of == "newton"),  # one precedes the capture
         "found": found(),
     }
     print(text(result))

@@ -284,8 +284,9 @@ def test_a_solve_that_has_not_converged_is_reported(monkeypatch):
 def test_thin_walls_of_bodies_are_reported():
     step, _ = material(2)
     walls = [mpm.Box((0.0, 0.0), (0.8, size)) for size in (0.4, 0.3)]
-    with pytest.warns(mpm.ThinWallWarning, match=r"obstacle 1 \(box\) is 3 dx thick"):
+    with pytest.warns(mpm.ThinWallWarning, match=r"obstacle 1 \(box\) is 3 dx thick") as found:
         FreeBodies(step, [Body(wall, 10.0, 1.0) for wall in walls]).check()
+    assert found[0].filename == __file__
 
 
 def test_what_has_no_derivative_is_an_error():
@@ -358,6 +359,34 @@ def test_mass_and_inertia_may_be_tensors(dim, device):
     expected, found = (bodies.advance(state, rows, 8, 2e-3)[1] for bodies in (number, tensor))
     torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-7)
     assert not torch.allclose(found, light, rtol=1e-3)
+
+
+@pytest.mark.parametrize("made", ["without a gradient", "before it requires one"])
+@pytest.mark.parametrize("per_axis", [False, True])
+def test_gradients_by_mass_and_inertia_of_bodies_made_without(made, per_axis, dim, device):
+    """They equal those by tensors that require a gradient when the body is made; a copy has its own parameters."""
+    step, state = material(dim, device)
+    rows = rows_of(dim, (1.05, 1.19, 0.97)[:dim], (0.2, -1.0, 0.1)[:dim], device=device)
+    inertia = torch.full((3 if per_axis and dim == 3 else 1,) if per_axis else (), 1.4, dtype=F64, device=device)
+    mass, ball = torch.tensor(80.0, dtype=F64, device=device), mpm.Sphere((0.0,) * dim, BALL, friction=0.4)
+
+    def gradients(body):
+        end = FreeBodies(step, [body]).advance(state, rows, 2, 2e-3)[1]
+        return torch.autograd.grad(end[..., dim:].square().sum(), (body.mass, body.inertia))
+
+    expected = gradients(Body(ball, mass.clone().requires_grad_(), inertia.clone().requires_grad_()))
+    if made == "without a gradient":
+        with torch.no_grad():
+            body = Body(ball, torch.nn.Parameter(mass), torch.nn.Parameter(inertia))
+    else:
+        body = Body(ball, mass, inertia)
+        mass.requires_grad_()
+        inertia.requires_grad_()
+    other = copy.deepcopy(body)
+    assert other.inertia is not body.inertia and other.inertia.requires_grad
+    for found in (gradients(body), gradients(other)):
+        torch.testing.assert_close(found, expected, rtol=1e-9, atol=0)
+    assert all(bool((value != 0).all()) for value in expected)
 
 
 def test_masses_of_another_device(device):

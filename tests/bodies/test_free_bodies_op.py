@@ -184,6 +184,22 @@ def test_a_body_around_all_of_the_material(dim, device, kind):
     compare(bodies, state, rows, n=3)
 
 
+@pytest.mark.parametrize("count", [7, 14])
+def test_many_bodies(count, device):
+    """Numbers of a scene that shared memory on CUDA has no room for: sums of several warps, and any."""
+    grid = mpm.Grid(0.1, (0.0,) * 3, (2.0, 1.6, 1.0))
+    step = mpm.Step(grid, mpm.NeoHookean(E=1e4, nu=0.3), (0.0, -9.8, 0.0))
+    points = mpm.seed.box((0.3, 0.4, 0.3), (1.7, 0.7, 0.7), grid, per_cell=8)
+    state = mpm.State.at_rest(points, 1000.0, None, F64, device)
+    balls = [Body(mpm.Sphere((0.0,) * 3, 0.08, friction=0.3), 2.0 + k, 0.01 + 0.002 * k) for k in range(count)]
+    rows = torch.zeros(1, count, 13, dtype=F64)
+    k = torch.arange(count)
+    rows[0, :, 0], rows[0, :, 1], rows[0, :, 2] = 0.4 + 0.19 * (k % 7), 0.77, 0.4 + 0.2 * (k // 7)
+    rows[..., 3], rows[..., 8], rows[..., 10] = 1.0, -1.0, 0.5
+    after = compare(FreeBodies(step, balls), state, rows.to(device), n=2)
+    assert float((after - rows.to(device))[..., 7:].abs().amax(2).min()) > 1e-3  # all have met the block
+
+
 @torch.no_grad()
 def test_results_do_not_depend_on_the_number_of_threads():
     """Nor do those of a second call, bit by bit."""

@@ -1,5 +1,6 @@
 """Obstacles as one solid: nodes against the corner that they are behind, in every way to describe it."""
 
+import copy
 import functools
 import itertools
 import math
@@ -664,5 +665,20 @@ def test_thin_walls_are_reported_by_name():
     assert all("is 3 dx thick" in line for line in found)
     grid = mpm.Grid(0.01, (0.0, 0.0), (0.2, 0.2))
     step = mpm.Step(grid, mpm.NeoHookean(E=1e5, nu=0.3), boundaries=walls[1:2])
-    with pytest.warns(mpm.ThinWallWarning, match="obstacle 0 .box. is 3 dx thick"):
+    with pytest.warns(mpm.ThinWallWarning, match="obstacle 0 .box. is 3 dx thick") as found:
         step.check()
+    assert found[0].filename == __file__
+
+
+def test_walls_of_samples_are_computed_once(monkeypatch):
+    """Until other samples are assigned; also for a copy and for a shape from the table of a kernel."""
+    shape = mpm.shapes.Sampled.of(mpm.shapes.Box([0.3, 0.04]), [-0.2] * 2, [0.2] * 2, 0.01)
+    thick = shape.thinnest_wall()
+    with monkeypatch.context() as patch:
+        patch.setattr(torch.nn.functional, "max_pool2d", None)
+        assert shape.thinnest_wall() == copy.deepcopy(shape).thinnest_wall() == thick
+    shape.values = shape.values + 0.01
+    assert shape.thinnest_wall() == pytest.approx(thick - 0.02, abs=1e-12)
+    like = torch.zeros(1, 2, dtype=torch.float64)
+    other = mpm.shapes.Sampled.from_row(like, like, shape.data(like))
+    assert other.thinnest_wall() == shape.thinnest_wall()

@@ -17,7 +17,9 @@ gymnasium = pytest.importorskip("gymnasium")
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 from gymnasium.vector import AutoresetMode  # noqa: E402
 
+import torch_mpm as mpm  # noqa: E402
 from torch_mpm import envs  # noqa: E402
+from torch_mpm.geometry.values import to_device  # noqa: E402
 
 F64 = torch.float64
 COARSE = {envs.Push: 0.05, envs.Roll: 0.05, envs.Pour: 0.04, envs.Scoop: 0.03, envs.Lift: 0.03, envs.Write: 0.04}
@@ -25,7 +27,7 @@ TASKS = pytest.mark.parametrize("task", envs.TASKS, ids=lambda task: task.__name
 
 
 def make(task: type = envs.Push, num_envs: int = 3, **options: Any) -> envs.MaterialEnv:
-    return task(num_envs, COARSE[task], **options)
+    return task(num_envs, next(COARSE[kind] for kind in task.__mro__ if kind in COARSE), **options)
 
 
 def forward(env: envs.MaterialEnv, speed: float = 0.6) -> Tensor:
@@ -143,30 +145,103 @@ def test_reset_by_mask_leaves_other_scenes(kind):
     assert env.steps.tolist() == [5, 2, 5]
 
 
+class BusyDevice:
+    """Work of half a second on a GPU, which begins anew at each part of what is launched.
+
+    A stream holds about a thousand launches, and the host waits for room where more of them follow: a step of many
+    kernels and the end of an episode may have more.
+    """
+
+    def __init__(self) -> None:
+        self.event = torch.cuda.Event()
+        self.begin()
+
+    def begin(self) -> None:
+        torch.cuda.synchronize()
+        torch.cuda._sleep(1_000_000_000)
+        self.event.record()
+
+    def check(self, part: str) -> None:
+        assert not self.event.query(), f"the host has waited before {part}"
+
+
+def test_large_seeds_are_folded():
+    """Those of `SeedSequence().entropy`, and numbers that pass 2^63 from scene to scene."""
+    env, again, entropy = make(), make(), 0x1234_5678_9ABC_DEF0_0FED_CBA9_8765_4321
+    first = env.reset(seed=entropy)[0]
+    assert torch.equal(first, again.reset(seed=[entropy, entropy + 1, entropy + 2])[0])
+    low, high = entropy & (2**63 - 1), entropy >> 63
+    assert env.seeds[0] == low ^ (high & (2**63 - 1)) ^ (high >> 63) and bool((env.seeds >= 0).all())
+    other = env.reset(seed=entropy + 2**64)[0]
+    assert not any(torch.equal(a, b) for a, b in zip(first, other, strict=True))
+    env.reset(seed=2**63 - 1)
+    assert env.seeds.tolist() == [2**63 - 1, 1, 0]
+
+
+@pytest.mark.parametrize("of_env", ["cpu", "other"])
+def test_masks_and_actions_of_another_device(device, of_env):
+    """They are read after the copy has ended, also where the device is busy before."""
+    there = "cpu" if of_env == "cpu" else device
+    env, plain = make(device=there), make(device=there)
+    for each in (env, plain):
+        each.reset(seed=0)
+    if device != "cpu":
+        torch.cuda._sleep(100_000_000)
+    mask, actions = torch.tensor([1, 0, 1], device=device) > 0, forward(env).to(device)
+    env.reset(options={"reset_mask": mask})
+    plain.reset(options={"reset_mask": np.array([True, False, True])})
+    torch.testing.assert_close(env.step(actions)[0], plain.step(forward(plain).to(there))[0])
+    assert env.steps.tolist() == [1, 1, 1] and env.episodes.tolist() == [1, 0, 1]
+    env.envs.reset(mask)
+    env.envs.freeze(torch.ones(3, device=device).cumsum(0).long() - 1)
+    assert env.envs.time.tolist()[::2] == [0.0, 0.0] and env.envs.frozen.all()
+
+
+@pytest.mark.parametrize("to", ["device", "host"])
+def test_copies_do_not_share_pinned_memory(device, to):
+    """Its owner may write to it before the device has read it."""
+    if device == "cpu":
+        pytest.skip("of CUDA")
+    torch.cuda._sleep(100_000_000)
+    given = torch.ones(3) if to == "device" else torch.ones(3, device=device)
+    given = given.pin_memory() if to == "device" else given
+    found = to_device(given, torch.device(device if to == "device" else "cpu"))
+    if to == "device":
+        given.zero_()
+    assert found.tolist() == [1.0, 1.0, 1.0]
+
+
 @TASKS
 def test_a_gpu_is_not_waited_for(task, device):
     """By steps, automatic resets and resets by mask, which return while it has not begun with them."""
     if device == "cpu":
         pytest.skip("of CUDA")
-    env = make(task, device=device, max_episode_steps=3)
+    busy: BusyDevice | None = None
+
+    class Watched(task):
+        def observation(self) -> Tensor:
+            if busy is not None:
+                busy.check("an observation")
+                busy.begin()
+            return super().observation()
+
+    env = make(Watched, device=device, max_episode_steps=3)
     mask = torch.tensor([True, False, True], device=device)
     with torch.no_grad():
         for k in range(6):
             if k in (0, 4):  # the first calls make constants and the pool of blocks
                 env.reset(seed=0 if k == 0 else None, options=None if k == 0 else {"reset_mask": mask})
             env.step(forward(env).to(device))
-        torch.cuda.synchronize()
-        torch.cuda._sleep(3_000_000_000)
-        busy = torch.cuda.Event()
-        busy.record()
+        busy = BusyDevice()
         env.step(forward(env).to(device, non_blocking=True))
+        busy.check("the end of a step")
         env.reset(options={"reset_mask": mask})
-        assert not busy.query(), "the host has waited"
+        busy.check("the end of a reset")
     assert not env.bodies.step.failures(env.envs.state).failed.any()
 
 
 def test_actions_of_a_gpu_that_are_not_finite_fail_their_scene(device):
-    """On the CPU they are an error, see below; here nobody reads them."""
+    """On the CPU they are an error, see below; here the particles that the body touches are not finite either."""
     if device == "cpu":
         pytest.skip("of CUDA")
     env = make(device=device)
@@ -175,7 +250,8 @@ def test_actions_of_a_gpu_that_are_not_finite_fail_their_scene(device):
     actions[1, 1] = math.nan
     *_, terminated, _, info = env.step(actions.to(device))
     assert terminated.tolist() == info["failed"].tolist() == [False, True, False]
-    assert env.failure_reasons()[1] == "the observation, the score or a pose is not finite"
+    reason = env.failure_reasons()[1]
+    assert re.match("[0-9]+ particles have a position that is NaN or infinite: .* in scene 1 ", reason)
     env.step(forward(env).to(device))
     assert not env.step(forward(env).to(device))[2].any()
 
@@ -440,6 +516,26 @@ def test_gradients_end_at_resets_and_at_detach():
     env.step(actions[2])[1].sum().backward()  # not through steps before the reset
 
 
+@pytest.mark.parametrize("kind", [np.array, torch.tensor])
+def test_gradients_end_at_a_mask_of_all_scenes(kind, device):
+    """A mask on the host frees the memory of the graph; one on a device is not read, and makes gradients zero."""
+    env = make(differentiable=True, device=device)
+    env.reset(seed=0)
+    actions = forward(env).to(device).requires_grad_()
+    env.step(actions)
+    assert env.envs.state.x.requires_grad and env.poses.requires_grad
+    env.reset(options={"reset_mask": kind([True] * 3)})
+    assert not any(t.requires_grad for t in (env.envs.state.x, env.envs.state.F, env.poses, env._score))
+    observation = env.step(actions)[0]
+    if device != "cpu":
+        env.reset(options={"reset_mask": torch.ones(3, dtype=torch.bool, device=device)})
+        assert env.envs.state.x.requires_grad
+        (gradient,) = torch.autograd.grad(env.step(forward(env).to(device))[1].sum(), actions, retain_graph=True)
+        assert not gradient.any()
+    observation.sum().backward()
+    assert actions.grad.any()
+
+
 @pytest.mark.parametrize("fail", [fail_by_velocity, fail_by_position, fail_by_score])
 def test_a_failed_scene_has_no_gradient_and_harms_no_other(fail):
     env = make(differentiable=True)
@@ -540,14 +636,76 @@ def test_wrong_calls_are_errors():
         env.render()
 
 
-def test_poses_of_scenes_have_a_shape():
-    class Turned(envs.Push):
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda made: {"poses": made.poses[:, 0]}, r"poses of scenes must have shape \[3, 1, 3\], got \[3, 3\]"),
+        (lambda made: {"goal": made.goal[:, 0]}, r"goal of scenes must have shape \[B, G\] = \[3, G\], got \[3\]"),
+        (lambda made: {"goal": made.goal[:1]}, r"goal of scenes .* got \[1, 1\]"),
+        (lambda made: {"fields": {"colour": made.goal}}, r"fields of scenes must be among \[.*'x'\], .* got 'colour'"),
+        (lambda made: {"fields": {"x": made.fields["x"][:, :-1]}}, r"field 'x' of scenes must have shape \[3, 64, 2\]"),
+        (lambda made: {"fields": {"mass": made.fields["x"]}}, r"field 'mass' .* \[3, 64\], got \[3, 64, 2\]"),
+        (lambda made: {"fields": {"x": made.fields["x"].long()}}, "field .x. .* must be torch.float32, got"),
+    ],
+)
+def test_what_scenes_return_is_checked(change, message):
+    class Changed(envs.Push):
         def scenes(self, random):
             made = super().scenes(random)
-            return made._replace(poses=made.poses[:, 0])
+            return made._replace(**change(made))
 
-    with pytest.raises(ValueError, match=r"poses of scenes must have shape \[3, 1, 3\], got \[3, 3\]"):
-        Turned(3, 0.05)
+    with pytest.raises((TypeError, ValueError), match=message):
+        Changed(3, 0.05)
+
+
+class Mixed(envs.Push):
+    """A lump of two laws, whose share differs from scene to scene, as do their plastic strain and their speed."""
+
+    RANDOM = 3
+
+    def __init__(self, num_envs: int, dx: float, **options: Any) -> None:
+        self.grid = mpm.Grid(dx, (0.0, 0.0), (1.0, 1.0), scenes=num_envs)
+        self.points = mpm.seed.box((0.0, 0.0), (0.2, 0.2), self.grid, per_cell=4)
+        disc = mpm.Sphere((0.0, 0.0), 0.1, "separate")
+        law = mpm.Mixture([mpm.NeoHookean(E=2e4, nu=0.3), mpm.VonMises(E=2e4, nu=0.3, yield_stress=1e3)])
+        step = mpm.Step(self.grid, law, walls="separate", boundaries=[disc])
+        envs.MaterialEnv.__init__(self, step, [disc], substeps=4, dt=1e-3, **options)
+
+    def particles(self):
+        state = super().particles()
+        return state.replace(material=torch.zeros(len(state), dtype=torch.int32, device=self.device))
+
+    def scenes(self, random):
+        made, rows = super().scenes(random), torch.arange(len(self.first), device=self.device)
+        second = rows < len(rows) * random[:, 2:]
+        fields = {"material": second.int(), "v": 0.1 * second[..., None].expand(-1, -1, 2).double()}
+        strain = next(iter(self.envs.first.extra))
+        return made._replace(fields={**made.fields, **fields, strain: 0.01 * second.double()})
+
+
+def test_fields_of_scenes_have_their_dtypes(device):
+    """Whole numbers stay whole, and histories of laws are fields too."""
+    env = make(Mixed, device=device)
+    env.reset(seed=0)
+    material, (strain, *_) = env.envs.observe("material"), env.envs.first.extra
+    assert material.dtype == torch.int32 and len(set(material.sum(1).tolist())) == 3
+    torch.testing.assert_close(env.envs.observe(strain), 0.01 * material.float())
+    torch.testing.assert_close(env.envs.observe("v")[..., 0], 0.1 * material.float())
+    assert not env.step(forward(env).to(device))[4]["failed"].any()
+
+
+def test_constants_of_inference_mode_serve_gradients():
+    """Numbers alone are not kept."""
+    env = make(differentiable=True)
+    with torch.inference_mode():
+        made = env.constant(((1.0, 2.0), (3.0, 4.0)))
+    kept = len(env._constants)
+    for k in range(3):
+        assert float(env.constant(0.1 * k, F64)) == 0.1 * k
+    assert len(env._constants) == kept and env.constant(((1.0, 2.0), (3.0, 4.0))) is made
+    leaf = torch.ones(2, 2, requires_grad=True)
+    (leaf * made).sum().backward()
+    assert torch.equal(leaf.grad, made)
 
 
 @TASKS

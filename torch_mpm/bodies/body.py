@@ -121,15 +121,17 @@ class Body:
     ) -> None:
         self.parts = parts_of(0, parts)
         self.mass = _positive("mass", mass, ((),))
+        # A view of a tensor would have no gradient where the body is made before the tensor requires one.
         moments = _positive("inertia", inertia, ((), (1,), (3,)))
-        self.inertia = moments.reshape(-1) if isinstance(moments, Tensor) else _tuple_of(moments)
+        self.inertia = moments if isinstance(moments, Tensor) else _tuple_of(moments)
         if joint is not None and type(joint) not in (Joint, Hinge, Slider, Driven):
             raise TypeError(f"joint must be a Hinge, a Slider, Driven or None, got {shape_of(joint)}")
         self.joint = joint or Joint()
 
     def check_dimension(self, dim: int) -> None:
         """Raise ValueError for a body of another dimension than D."""
-        if len(self.inertia) not in ((1,) if dim == 2 else (1, 3)):
+        count = self.inertia.numel() if isinstance(self.inertia, Tensor) else len(self.inertia)
+        if count not in ((1,) if dim == 2 else (1, 3)):
             raise ValueError(
                 f"inertia must be {'a number in 2-D' if dim == 2 else 'one or three numbers'}, got {self.inertia}"
             )
@@ -168,7 +170,7 @@ class Body:
 
     def moments_like(self, like: Tensor, dim: int) -> Tensor:
         """Moments of inertia [1] (2-D) or [3] (3-D) in float64 on the device of `like`; see `mass_like`."""
-        return _like("inertia", self.inertia, like).expand(1 if dim == 2 else 3)
+        return _like("inertia", self.inertia, like).reshape(-1).expand(1 if dim == 2 else 3)
 
 
 def mobility(matrix: Tensor, directions: Tensor | None) -> Tensor:

@@ -25,5 +25,6 @@ def thin_walls(boundaries: Sequence[Any], dx: float) -> Iterator[str]:
 
 
 def warn_of_thin_walls(boundaries: Sequence[Any], dx: float) -> None:
+    """Warn of obstacles that are thinner than `LEAST`, at the line that called a public `check`."""
     for found in thin_walls(boundaries, dx):
-        warnings.warn(found, ThinWallWarning, stacklevel=4)
+        warnings.warn(found, ThinWallWarning, stacklevel=3)

@@ -41,7 +41,10 @@ def reset_mask(options: dict[str, Any] | None, scenes: int) -> Tensor | None:
 
 
 def seeds_of_scenes(seed: Any, scenes: int) -> list[int | None]:
-    """Seeds of the scenes, those of a list or consecutive numbers; TypeError, ValueError for another seed."""
+    """Seeds of the scenes below 2^63, those of a list or consecutive numbers; TypeError, ValueError for another seed.
+
+    Larger numbers are folded, as of `np.random.SeedSequence().entropy`, which has 128 bits.
+    """
     seeds = list(seed) if isinstance(seed, Sequence) else [seed] * scenes
     if len(seeds) != scenes:
         raise ValueError(f"seed must be a number or a list of {scenes}, got {len(seeds)}")
@@ -49,4 +52,9 @@ def seeds_of_scenes(seed: Any, scenes: int) -> list[int | None]:
         if one is not None and (isinstance(one, bool) or not isinstance(one, (int, np.integer)) or one < 0):
             raise ValueError(f"seed must be a whole number >= 0, or a list of such numbers and None, got {one!r}")
     first = not isinstance(seed, Sequence)
-    return [None if one is None else int(one) + first * b for b, one in enumerate(seeds)]
+    return [None if one is None else _folded(int(one) + first * b) for b, one in enumerate(seeds)]
+
+
+def _folded(seed: int) -> int:
+    """A seed of 63 bits: the exclusive or of the groups of 63 bits of a number; the number itself below 2^63."""
+    return seed if seed < 2**63 else _folded(seed >> 63) ^ (seed & (2**63 - 1))

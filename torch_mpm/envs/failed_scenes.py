@@ -38,9 +38,9 @@ class GradientGate:
 def sentences(failures: Failures, failed: Sequence[bool]) -> list[str | None]:
     """Why scenes failed; None for the others."""
     problems = (*failures.given.values(), *failures.problems.values())
-    found: list[str | None] = []
-    for b, wrong in enumerate(failed):
+    found: list[str | None] = [None] * len(failed)
+    for b in (b for b, wrong in enumerate(failed) if wrong):
         others = [k != b for k in range(len(failed))]
-        parts = [sentence for problem in problems if wrong and (sentence := problem.sentence(others))]
-        found.append("; ".join(parts) or "the observation, the score or a pose is not finite" if wrong else None)
+        parts = [sentence for problem in problems if (sentence := problem.sentence(others))]
+        found[b] = "; ".join(parts) or "the observation, the score or a pose is not finite"
     return found

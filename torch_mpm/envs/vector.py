@@ -16,8 +16,9 @@ from ..bodies.exchange import POSE, VELOCITY, Part, RigidBodies, moved
 from ..boundaries.obstacles import Obstacle
 from ..cuda_graphs.capture import is_readable
 from ..errors import FLOATING, check_count, check_flag, check_number, default_dtype, shape_of
+from ..geometry.values import to_device
 from ..rollouts.environments import Environments
-from ..state.state import State
+from ..state.state import PARTICLE_FIELDS, State
 from ..step.failures import Failures
 from ..step.step import Step
 from .arguments import autoreset_mode as check_autoreset_mode
@@ -34,7 +35,9 @@ class Scenes(NamedTuple):
     Attributes:
         poses: poses of the K bodies [B, K, 3] (2-D) or [B, K, 7] (3-D).
         goal: numbers of the goals [B, G]; None for no numbers.
-        fields: fields of the particles that differ from those of `MaterialEnv.particles`, by name [B, R, ...].
+        fields: fields of the particles that differ from those of `MaterialEnv.particles`, of `State` or
+            `State.extra`, by name [B, R, ...]. Floating ones are converted to the dtype of the field; others must have
+            it.
     """
 
     poses: Tensor
@@ -60,7 +63,8 @@ class MaterialEnv(gymnasium.vector.VectorEnv):
             last observation, rewards of 0 and unchanged flags, until `reset` with a mask. Also gymnasium's
             `AutoresetMode`; its "SameStep" is not supported.
         differentiable: rewards and observations have gradients by the actions and by what else in the step requires
-            one, from step to step until `detach`, or a reset of all scenes.
+            one, from step to step until `detach`, or a reset of all scenes: one without a mask, or with a mask on the
+            host that is true everywhere.
         numpy: return arrays instead of tensors.
         render_mode: "rgb_array" for `render`, or None.
         dtype, device: of the particles and of all results; None for torch's defaults.
@@ -68,8 +72,12 @@ class MaterialEnv(gymnasium.vector.VectorEnv):
     Attributes:
         envs: the scenes (`Environments`).
         bodies: the bodies (`RigidBodies`).
+        first: particles of a scene as `particles` made them (`State`).
         poses: poses of the bodies [B, K, 3] (2-D) or [B, K, 7] (3-D), float64; see `torch_mpm.bodies.exchange`.
         goal: numbers of the goals [B, G].
+        seeds: seed of the random numbers of each scene, int64 [B].
+        episodes: number of the episode of each scene since its seed was given, int64 [B].
+        steps: steps of each scene in its episode, int64 [B].
         ended: episodes that have ended and were not reset, bool [B].
 
     Raises:
@@ -191,11 +199,17 @@ class MaterialEnv(gymnasium.vector.VectorEnv):
     # ---- parts for tasks
 
     def constant(self, numbers: Any, dtype: torch.dtype | None = None) -> Tensor:
-        """A number, or nested tuples of numbers, as a tensor on `device`, which is made once; in `dtype` by default."""
-        key = numbers, self.dtype if dtype is None else dtype
-        if key not in self._constants:
-            self._constants[key] = torch.tensor(numbers, dtype=key[1], device=self.device)
-        return self._constants[key]
+        """A number, or nested tuples of numbers, as a tensor on `device`, in `dtype` by default.
+
+        Those of tuples are made once and kept: their numbers must not change from step to step.
+        """
+        dtype = self.dtype if dtype is None else dtype
+        if not isinstance(numbers, tuple):
+            return torch.full((), numbers, dtype=dtype, device=self.device)
+        if (numbers, dtype) not in self._constants:
+            with torch.inference_mode(False):  # A later step may then differentiate through it.
+                self._constants[numbers, dtype] = torch.tensor(numbers, dtype=dtype, device=self.device)
+        return self._constants[numbers, dtype]
 
     def columns(self, *values: Tensor | float) -> Tensor:
         """Tensors [B] and numbers side by side [B, n], float64."""
@@ -246,10 +260,12 @@ class MaterialEnv(gymnasium.vector.VectorEnv):
         """Begin new episodes.
 
         Args:
-            seed: scene b gets seed + b, or seed[b] of a list; the same scene whatever the others are. None continues
-                the random numbers of each scene.
+            seed: scene b gets seed + b, or seed[b] of a list; the same scene whatever the others are. Numbers of 2^63
+                or more are folded to 63 bits. None continues the random numbers of each scene.
             options: {"reset_mask": bool [B], a tensor or an array} resets these scenes only; the others are unchanged,
-                bit by bit. A reset without a mask ends all gradients.
+                bit by bit. A reset without a mask ends all gradients, and so does one with a mask on the host that is
+                true everywhere. A mask on a device is not read: gradients end in its scenes, and `detach` frees their
+                memory.
 
         Returns:
             Observations [B, O], and an empty dictionary.
@@ -260,9 +276,9 @@ class MaterialEnv(gymnasium.vector.VectorEnv):
         mask = reset_mask(options, self.num_envs)
         if not self._began and mask is not None:
             raise RuntimeError("reset must be called without a mask before the first reset with one")
-        which = torch.ones_like(self.terminated) if mask is None else mask.to(self.device, non_blocking=True)
+        which = torch.ones_like(self.terminated) if mask is None else to_device(mask, self.device)
         self._seed(seed, which)
-        if mask is None:
+        if mask is None or (is_readable(mask) and bool(mask.all())):
             self.detach()
         with torch.set_grad_enabled(self._has_graph()):
             self._begin(which)
@@ -283,7 +299,8 @@ class MaterialEnv(gymnasium.vector.VectorEnv):
 
         Raises:
             TypeError, ValueError: for other actions, for ones that require a gradient where the environment is not
-                differentiable, and on the CPU for ones that are not finite; on CUDA their scenes fail.
+                differentiable, and on the CPU for ones that are not finite; on CUDA their scenes fail, and the reason
+                is that particles are not finite.
             RuntimeError: before the first reset.
         """
         if not self._began:
@@ -339,19 +356,40 @@ class MaterialEnv(gymnasium.vector.VectorEnv):
             seeds = [first + b if own is None else own for b, own in enumerate(seeds)]
         if all(own is None for own in seeds):
             return
-        given = torch.tensor([-1 if own is None else own for own in seeds]).to(self.device, non_blocking=True)
+        given = to_device(torch.tensor([-1 if own is None else own for own in seeds], device="cpu"), self.device)
         chosen = which & (given >= 0)
         self.seeds = torch.where(chosen, given, self.seeds)
         self.episodes = torch.where(chosen, -1, self.episodes)  # `_replace` counts the episode.
 
     def _drawn(self) -> Scenes:
-        """How the present episodes of all scenes begin; poses in float64, goals and fields in `dtype`."""
+        """How the present episodes of all scenes begin: poses in float64, goals in `dtype`, fields in their own dtype.
+
+        Raises:
+            TypeError, ValueError: for poses, goals or fields of another shape, and fields of another dtype or name.
+        """
         made = self.scenes(uniform(self.seeds, self.episodes, self.RANDOM))
         shape = self.num_envs, len(self.bodies), POSE[self.dim]
         if tuple(made.poses.shape) != shape:
             raise ValueError(f"poses of scenes must have shape {list(shape)}, got {shape_of(made.poses)}")
-        goal = None if made.goal is None else made.goal.to(self.dtype)
-        return Scenes(made.poses.double(), goal, {name: value.to(self.dtype) for name, value in made.fields.items()})
+        goal = made.goal
+        if goal is not None and (goal.dim() != 2 or len(goal) != self.num_envs):
+            raise ValueError(f"goal of scenes must have shape [B, G] = [{self.num_envs}, G], got {shape_of(goal)}")
+        fields = {name: self._checked_field(name, value) for name, value in made.fields.items()}
+        return Scenes(made.poses.double(), None if goal is None else goal.to(self.dtype), fields)
+
+    def _checked_field(self, name: str, value: Tensor) -> Tensor:
+        """A field of the particles of all scenes [B, R, ...] in the dtype of that field."""
+        known = _fields_of(self.envs.first)
+        if name not in known:
+            raise ValueError(f"fields of scenes must be among {sorted(known)}, which the particles have, got {name!r}")
+        shape = [self.num_envs, self.envs.room, *known[name].shape[1:]]
+        if list(value.shape) != shape:
+            raise ValueError(f"field {name!r} of scenes must have shape {shape}, got {shape_of(value)}")
+        if value.is_floating_point() and known[name].is_floating_point():
+            value = value.to(known[name].dtype)
+        if value.dtype != known[name].dtype:
+            raise TypeError(f"field {name!r} of scenes must be {known[name].dtype}, got {value.dtype}")
+        return value
 
     def _begin(self, which: Tensor) -> None:
         """Begin new episodes in the scenes of a mask bool [B]."""
@@ -363,7 +401,9 @@ class MaterialEnv(gymnasium.vector.VectorEnv):
         """Replace the scenes of a mask bool [B]. All scenes are drawn, because reading the mask would wait for it."""
         self.episodes = self.episodes + which
         made = self._drawn()
-        self.envs.reset(which, self.envs.first.replace(**{n: v.flatten(0, 1) for n, v in made.fields.items()}))
+        fields, first = {name: value.flatten(0, 1) for name, value in made.fields.items()}, self.envs.first
+        extra = {name: fields.pop(name, value) for name, value in first.extra.items()}
+        self.envs.reset(which, first.replace(**fields, extra=extra))
         self.poses = torch.where(which[:, None, None], made.poses, self.poses)
         if made.goal is not None:
             self.goal = torch.where(which[:, None], made.goal, self.goal)
@@ -427,12 +467,19 @@ class MaterialEnv(gymnasium.vector.VectorEnv):
         if not isinstance(actions, (Tensor, np.ndarray)) or list(actions.shape) != shape:
             given = list(actions.shape) if isinstance(actions, np.ndarray) else shape_of(actions)
             raise ValueError(f"actions must be a tensor or an array [B, A] = {shape}, got {given}")
-        values = torch.as_tensor(actions).to(self.device, self.dtype)
+        values = actions if isinstance(actions, Tensor) else torch.as_tensor(actions, device="cpu")
+        values = to_device(values, self.device, self.dtype)
         if values.requires_grad and torch.is_grad_enabled() and not self.differentiable:
             raise ValueError("actions must not require grad where differentiable is False: detach them")
         if is_readable(values) and not bool(values.isfinite().all()):
             raise ValueError("actions must be finite, got NaN or infinity")
         return values.clamp(-1.0, 1.0)
+
+
+def _fields_of(state: State) -> dict[str, Tensor]:
+    """Fields of the particles that a state has, by name."""
+    named = {name: getattr(state, name) for name in PARTICLE_FIELDS}
+    return {name: value for name, value in named.items() if value is not None} | state.extra
 
 
 def _may_have_some(mask: Tensor) -> bool:

@@ -122,6 +122,18 @@ def filled(value: Any, like: Tensor, dtype: torch.dtype | None = None) -> Tensor
     return entries[0] if numbers is not value else torch.stack(entries)
 
 
+def to_device(value: Tensor, device: torch.device, dtype: torch.dtype | None = None) -> Tensor:
+    """A tensor on a device, which is not waited for; copies to the host wait, since the host reads them at once.
+
+    Pinned memory is copied on the host first: its owner may write to it before the device has read it.
+    """
+    if device.type == "cpu":
+        return value.to(device, dtype)
+    if value.is_cpu and value.is_pinned():
+        value = value.clone(memory_format=torch.contiguous_format)
+    return value.to(device, dtype, non_blocking=True)
+
+
 def shape_of_value(value: Any) -> tuple[int, ...]:
     """Shape of a stored value."""
     if isinstance(value, Tensor) or hasattr(value, "__array__"):

@@ -25,6 +25,7 @@ from torch import Tensor
 
 from ..boundaries.impulses import Impulses
 from ..errors import check_count, shape_of
+from ..geometry.values import to_device
 from ..ops.arguments import split_dt
 from ..state.state import EXTRA, PARTICLE_FIELDS, State, check_state, tensors_of
 from ..step.pause import standing
@@ -247,12 +248,12 @@ class Environments:
         if which.dtype == torch.bool:
             if which.shape != self.time.shape:
                 raise ValueError(f"a mask of scenes must have shape [B] = [{len(self)}], got {shape_of(which)}")
-            return which.to(self.time.device, non_blocking=True)
+            return to_device(which, self.time.device)
         if which.numel() and (which.is_floating_point() or which.is_complex()):
             raise TypeError(f"scenes must be a mask or whole numbers, got {which.dtype}")
         if which.is_cpu and which.numel() and not (0 <= int(which.min()) and int(which.max()) < len(self)):
             raise ValueError(f"scenes must be from 0 to {len(self) - 1}, got {which.tolist()}")
-        return which.reshape(-1).to(self.time.device, torch.int64, non_blocking=True)
+        return to_device(which.reshape(-1), self.time.device, torch.int64)
 
     def _mask(self, which: Tensor) -> Tensor:
         """Mask bool [B] of scenes."""

@@ -86,6 +86,7 @@ class Sampled(Shape):
     arguments = ("values", "lower", "spacing")
     number = 5
     CHECKS: ClassVar = {"values": _checked_samples}
+    _thinnest: float | None
 
     def __init__(self, values: Tensor, lower: Sequence[float], spacing: float) -> None:
         _checked_samples("values", values)
@@ -114,9 +115,20 @@ class Sampled(Shape):
         shape.values = data[2 * dim + 1 :].reshape([int(n) for n in data[dim + 1 : 2 * dim + 1]])
         return shape
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name in ("values", "spacing"):
+            self._thinnest = None
+        super().__setattr__(name, value)
+
     def thinnest_wall(self) -> float:
-        """By the samples in the middle of walls, which are no less deep than their neighbours; a wall between samples
-        may be thinner by a spacing. The spacing where no sample is inside."""
+        """Thickness [m] by the samples in the middle of walls, which are no less deep than their neighbours; of walls
+        of constant thickness. A wall between samples may be thinner by a spacing. The spacing where no sample is
+        inside. It is computed once for assigned values."""
+        if self._thinnest is None:
+            self._thinnest = self._thinnest_of_samples()
+        return self._thinnest
+
+    def _thinnest_of_samples(self) -> float:
         depth, pool = -self.values, torch.nn.functional.max_pool2d
         if depth.dim() == 3:
             pool = torch.nn.functional.max_pool3d
