@@ -2,6 +2,7 @@
 
 import math
 
+import heat_scenes
 import pytest
 import torch
 from helpers import SingleSteps, relative_error
@@ -339,3 +340,22 @@ def test_compiled_steps_that_were_never_called(kept, law, device):
         return torch.autograd.grad(end.x.sum() + end.v.square().sum(), v)[0]
 
     torch.testing.assert_close(gradient(True, kept), gradient(False, None), rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["heat", "history"])
+def test_memory_does_not_grow_with_the_steps(kind, device):
+    """Of three states, for lists of tensors of the op of many steps too: those of heat, and the history of a law."""
+    step, state = heat_scenes.scene(2, law="viscoelastic" if kind == "history" else "neo_hookean", device=device)
+    if kind == "history":
+        history = {name: t for name, t in state.extra.items() if name != "temperature_gradient"}
+        step.heat, state = None, state.replace(temperature=None, extra=history)
+
+    def most(n):
+        def run():
+            v = state.v.clone().requires_grad_()
+            end = mpm.rollout(step, state.replace(v=v), n, heat_scenes.DT, checkpoint=mpm.Checkpoints(states=3))
+            torch.autograd.grad(end.x.square().sum(), v)
+
+        return memory.of_returned_tensors(run)
+
+    assert most(40) < 1.2 * most(10)

@@ -202,7 +202,7 @@ def _backward_fake(grads, needs, record, *arguments):
 
 def _setup(ctx: Any, inputs: Any, output: Any) -> None:
     given = dict(zip(_SCHEMA, inputs, strict=True)) | {"previous_status": None}  # The adjoint does not read these.
-    lists = [given[name] for name in _LISTS]
+    lists = [given.pop(name) for name in _LISTS]  # Stored by autograd alone, so that checkpoints release them.
     ctx.lengths_of_lists = [len(tensors) for tensors in lists]
     ctx.set_materialize_grads(False)
     ctx.save_for_backward(output[-1], *(given.pop(name) for name in _TENSORS), *(t for ts in lists for t in ts))
