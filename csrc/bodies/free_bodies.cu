@@ -339,8 +339,8 @@ struct BlockTeam {
     add_up(impulses, slopes);
   }
 
-  // By the first warps, each with the nodes of every so many tiles. The sums of a warp have the order of its nodes, and
-  // those of the warps their own.
+  // The first warps, `adders` of them, add up; a warp processes the nodes of every `adders`-th tile. A warp adds its
+  // nodes in their order. The sums of the warps are added in the order of the warps.
   __device__ __noinline__ void add_up(double* impulses, double* slopes) const {
     const int m = a.bodies * n, warp = int(threadIdx.x) / 32;
     const int of_impulses = impulses ? m : 0, of_slopes = slopes ? m * m : 0, entries = of_impulses + of_slopes;

@@ -105,8 +105,8 @@ struct SceneMemory {
 };
 
 // The bodies of one scene. A team of threads calls all functions together: `team.each(count, f)` calls f(i) for each
-// number, `team.sync()` waits for all threads, and the sums over the nodes are the team's, complete on return:
-// `add_up(scene, impulses, slopes)`, either of which may be null. `change_nodes(scene)` changes the velocities.
+// number, and `team.sync()` waits for all threads. `add_up(scene, impulses, slopes)` computes the sums over the nodes,
+// which are complete on return; a null pointer skips its sums. `change_nodes(scene)` changes the velocities.
 template <class T, int D, class Team>
 class SceneBodies {
  public:

@@ -3,8 +3,9 @@
 // Sums over the lanes of a warp of several numbers each, in a fixed order.
 namespace mpm::cuda {
 
-// Adds numbers over the lanes that differ in the bits of `Mask` and below, of which half of the lanes keep one half and
-// the others the other half. The lane has the sums [first, first + count) then, from values[0] on.
+// Sums of numbers over the lanes that differ in the bits of `Mask` and below. Each step adds the numbers of two lanes;
+// one of them keeps the lower half of the sums, the other the upper half. At the end a lane stores the sums [first,
+// first + count) in `values`, from values[0] on.
 template <int Count, int Mask, int N>
 __device__ void scatter_sums(double (&values)[N], int& first, int& count) {
   if constexpr (Mask > 0) {

@@ -129,15 +129,7 @@ void heat_to_nodes_backward(const HeatToNodesBackwardArguments<T, D>& a) {
   for_outside(a.forward.topology, [&](int64_t p) { skip_heat_of_nodes_backward(a, p); });
 }
 
-MPM_INSTANTIATE_ORDERS(heat_to_particles_backward, HeatToParticlesBackwardArguments)
-MPM_INSTANTIATE(heat_term_backward, HeatTermBackwardArguments)
-MPM_INSTANTIATE(heat_numbers_backward, HeatNumbersBackwardArguments)
-MPM_INSTANTIATE(heat_held_backward, HeatHeldBackwardArguments)
-MPM_INSTANTIATE(heat_surface_temperature_backward, HeatSurfaceTemperatureBackwardArguments)
-MPM_INSTANTIATE(heat_nodes_backward, HeatNodesBackwardArguments)
-MPM_INSTANTIATE(heat_layers_backward, HeatLayersBackwardArguments)
-MPM_INSTANTIATE(heat_surface_row_backward, HeatSurfaceRowBackwardArguments)
-MPM_INSTANTIATE_ORDERS(heat_to_nodes_backward, HeatToNodesBackwardArguments)
+MPM_HEAT_BACKWARD_KERNELS(MPM_INSTANTIATE, MPM_INSTANTIATE_ORDERS, MPM_INSTANTIATE_SIZE)
 
 }  // namespace TORCH_MPM_ISA
 }  // namespace mpm::cpu

@@ -32,10 +32,7 @@ struct HeatAdjointSums {
   __device__ Loaded load(int, int scene) const { return {scene}; }
   template <class Support>
   __device__ Result compute(const Loaded&, const Weights<Order, T, D>& w, const Support& support) const {
-    const T constant[K] = {}, linear[K][D] = {};
-    Result s;
-    sum_axis<Shape, 0>(support, support.rows, 0, w, constant, linear, s);
-    return s;
+    return sum_support<Shape>(support, w);
   }
   __device__ HeatGathered<T, D, K> gathered(const Result& s) const {
     HeatGathered<T, D, K> g;
@@ -168,14 +165,6 @@ void heat_to_nodes_backward(const HeatToNodesBackwardArguments<T, D>& a, Stream 
     launch_gather(HeatToNodesPullBack<Order, T, D, false>(a), stream);
 }
 
-MPM_INSTANTIATE_ORDERS(heat_to_particles_backward, HeatToParticlesBackwardArguments)
-MPM_INSTANTIATE(heat_term_backward, HeatTermBackwardArguments)
-MPM_INSTANTIATE(heat_numbers_backward, HeatNumbersBackwardArguments)
-MPM_INSTANTIATE(heat_held_backward, HeatHeldBackwardArguments)
-MPM_INSTANTIATE(heat_surface_temperature_backward, HeatSurfaceTemperatureBackwardArguments)
-MPM_INSTANTIATE(heat_nodes_backward, HeatNodesBackwardArguments)
-MPM_INSTANTIATE(heat_layers_backward, HeatLayersBackwardArguments)
-MPM_INSTANTIATE(heat_surface_row_backward, HeatSurfaceRowBackwardArguments)
-MPM_INSTANTIATE_ORDERS(heat_to_nodes_backward, HeatToNodesBackwardArguments)
+MPM_HEAT_BACKWARD_KERNELS(MPM_INSTANTIATE, MPM_INSTANTIATE_ORDERS, MPM_INSTANTIATE_SIZE)
 
 }  // namespace mpm::cuda

@@ -169,10 +169,7 @@ struct AdvanceItem {
       k.packed.counts[int64_t(number) * Cells::cells + c] = uint16_t(m.order.count[c]);
     for (int i = threadIdx.x; i < count; i += threads) {
       const int cell = m.order.rank[i] / kItemParticles, rank = m.order.rank[i] % kItemParticles;
-      if (cell < Cells::cells)
-        k.packed.particles[begin + m.order.place(cell, rank)] = m.packed[i];
-      else
-        k.packed.particles[begin + count - 1 - rank] = packed_out_of_block<T, D>(particle(i), m.packed[i].conductance);
+      store_packed(k.packed, m.order, begin, begin + count, cell, rank, m.packed[i], [&] { return particle(i); });
     }
   }
 

@@ -99,6 +99,17 @@ __device__ PackedParticle<T, D> packed_out_of_block(int particle, const T& condu
   return q;
 }
 
+// Stores a particle of the item [begin, end): in its cell, by its rank there; or out of the block, from the end on, by
+// its number particle().
+template <class S, class T, int D, class Number>
+__device__ void store_packed(const PackedItems<T, D>& packed, const PackedOrder<S>& order, int begin, int end, int cell,
+                             int rank, const PackedParticle<T, D>& q, const Number& particle) {
+  if (cell < S::cells)
+    packed.particles[begin + order.place(cell, rank)] = q;
+  else
+    packed.particles[end - 1 - rank] = packed_out_of_block<T, D>(particle(), q.conductance);
+}
+
 // Particles of its cell that a lane processes in each part of a block.
 template <class S>
 struct LaneCounts {

@@ -69,15 +69,10 @@ __global__ void __launch_bounds__(kPackThreads) pack_kernel(const __grid_constan
     for (int c = threadIdx.x; c < S::cells; c += kPackThreads)
       k.packed.counts[int64_t(i) * S::cells + c] = uint16_t(m.count[c]);
     __syncthreads();
-    PackedParticle<T, D>* const to = k.packed.particles;
 #pragma unroll
-    for (int n = 0; n < kEachPacked; n++) {
-      if (!exists(n)) continue;
-      if (cell[n] < S::cells)
-        to[item.begin + m.place(cell[n], rank[n])] = q[n];
-      else
-        to[item.end - 1 - rank[n]] = packed_out_of_block<T, D>(particle[n], q[n].conductance);
-    }
+    for (int n = 0; n < kEachPacked; n++)
+      if (exists(n))
+        store_packed(k.packed, m, item.begin, item.end, cell[n], rank[n], q[n], [&] { return particle[n]; });
     __syncthreads();
   }
 }

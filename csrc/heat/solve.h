@@ -148,11 +148,11 @@ MPM_HD double step_of_scene(const HeatArguments<T, D>& a, int scene) {
 }
 
 // The simple steps d += ω_k (M/dt + X)⁻¹ r. The spectrum of (M/dt + X)⁻¹ A is that of 1 + λ, 0 ≤ λ ≤ c. The first step
-// has ω = 1, so that no residual remains where λ = 0 and the energy is conserved; each step then multiplies the
-// residual by (μ − λ)/(1 + μ) for ω = 1/(1 + μ). The products of λ and these factors are smallest on [0, c] for the
-// roots of Chebyshev's polynomials, of which the first lies at 0 and the last extremum at c. With the roots cos(π (2 k
-// + 1)/(2 n)) of n steps moved to 0 and above, h = c / (1 + cos(π/(2 n))) is half of their interval, and the product is
-// hⁿ 2^(1 − n) at most.
+// has ω = 1: it leaves no residual where λ = 0, so the energy is conserved, and multiplies the residual by −λ. Each
+// further step multiplies it by (μ − λ)/(1 + μ), where ω = 1/(1 + μ). The product of n steps is least on [0, c] where 0
+// and the μ are the roots of a Chebyshev polynomial, shifted and scaled: the first root cos(π (2 k + 1)/(2 n)) to 0,
+// the end of its interval to c. Half of that interval is h = c / (1 + cos(π/(2 n))), and the product is at most hⁿ 2^(1
+// − n).
 MPM_HD double simple_reduction(int steps, double c) {
   return steps == 1 ? c : steps == 2 ? 0.1715728752538099 * c * c : 0.038475772933681186 * c * c * c;
 }

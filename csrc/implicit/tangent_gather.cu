@@ -40,9 +40,7 @@ struct TangentGather {
   }
   template <class Support>
   __device__ Result compute(const Loaded& l, const Weights<Order, T, D>& w, const Support& support) const {
-    const T constant[K] = {}, linear[K][D] = {};
-    Sums<Shape> s;
-    sum_axis<Shape, 0>(support, support.rows, 0, w, constant, linear, s);
+    const Sums<Shape> s = sum_support<Shape>(support, w);
     Result L;
 #pragma unroll
     for (int k = 0; k < D; k++)

@@ -83,10 +83,7 @@ struct AdvanceGather {
   }
   template <class Support>
   __device__ Result compute(const Weights<Order, T, D>& w, const Support& support) const {
-    const T constant[K] = {}, linear[K][D] = {};
-    Result s;
-    sum_axis<Shape, 0>(support, support.rows, 0, w, constant, linear, s);
-    return s;
+    return sum_support<Shape>(support, w);
   }
   // The velocity and the affine field.
   __device__ Motion<T, D> motion(const Result& s) const {

@@ -42,10 +42,7 @@ struct FieldGather {
   __device__ Loaded load(int, int) const { return {}; }
   template <class Support>
   __device__ Result compute(Loaded, const Weights<Order, T, D>& w, const Support& support) const {
-    const T constant[K] = {}, linear[K][D] = {};
-    Result s;
-    sum_axis<Shape, 0>(support, support.rows, 0, w, constant, linear, s);
-    return s;
+    return sum_support<Shape>(support, w);
   }
   __device__ void write(int p, const Loaded&, const Result& s) const {
 #pragma unroll

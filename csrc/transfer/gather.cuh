@@ -198,6 +198,16 @@ __device__ void sum_axis(const Support& support, const BlockRows<Blocks>& rows, 
   }
 }
 
+// Sums without slopes.
+template <class S, class Support, class T>
+__device__ Sums<S> sum_support(const Support& support, const Weights<S::Order, T, S::D>& w) {
+  static_assert(S::Slope == SlopeForm::none);
+  const T constant[S::K] = {}, linear[S::K][S::D] = {};
+  Sums<S> sums;
+  sum_axis<S, 0>(support, support.rows, 0, w, constant, linear, sums);
+  return sums;
+}
+
 // slope_i += Σ_j ∂_i ∂_j N (Σ_c g_c gradient_cj): the derivative of the gradient term.
 template <class S, class Support, class T>
 __device__ void add_hessian(const Support& support, const Weights<S::Order, T, S::D>& w,

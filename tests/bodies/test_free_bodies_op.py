@@ -159,7 +159,7 @@ def test_momentum_of_body_and_nodes(dim, device):
 @torch.no_grad()
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
 def test_many_scenes(dim, device, dtype):
-    """Each of many scenes moves as one of few, of which CUDA has more threads for each."""
+    """Bodies of many scenes move as those of few. CUDA uses fewer threads for each of many scenes."""
     bodies, state, rows = made(dim, device, dtype, shape="box", scenes=2, walls="slip")
     _, expected = bodies.advance(state, rows, 2, 2e-3)
     times = 128
