@@ -1,4 +1,5 @@
 #include "heat/blocks.cpu.h"
+#include "heat/kernels.h"
 #include "heat/local_backward.h"
 #include "transfer/gather.cpu.h"
 
