@@ -26,21 +26,27 @@ MPM_HD Vector<S, 2> offset_from_edge(const ValueOf<S>* a, const ValueOf<S>* b, c
   return arm + (along > S(0) ? S(0) - along : S(0)) * edge;
 }
 
-// Whether a point inside a polygon is nearly as deep below an edge, or the corner at its end, as below its nearest
-// edge. A corner of an angle α is at most 1/sin(α/2) times as far as it is deep, twice for 60 degrees.
-template <class T>
-MPM_HD bool is_nearly_as_deep(const T* a, const T* b, const Vector<T, 2>& p, const T& depth) {
-  const Vector<T, 2> offset = offset_from_edge(a, b, p), edge = {{b[0] - a[0], b[1] - a[1]}};
-  const T along = dot(offset, edge), squared = dot(offset, offset);
-  const bool at_corner = along * along > T(1e-6) * squared * dot(edge, edge);
-  const T far = (at_corner ? T(2) : T(1.001)) * depth;
-  return !(squared > far * far);
+// Height of a point (distance from the axis, position along it) above the line of edge k of a polygon; `beyond` is how
+// far the foot of the point is beyond the ends of the edge. Far above where the edge is on the axis, inside the body.
+template <class S>
+MPM_HD S edge_height(const ValueOf<S>* corner, int corners, int k, const Vector<S, 2>& p, Vector<S, 2>& normal,
+                     ValueOf<S>& beyond) {
+  using T = ValueOf<S>;
+  const T *const a = corner + 2 * k, *const b = end_of_edge(corner, corners, k);
+  const Vector<S, 2> edge = {{lift<S>(b[0] - a[0]), lift<S>(b[1] - a[1])}};
+  const Vector<S, 2> arm = {{p[0] - lift<S>(a[0]), p[1] - lift<S>(a[1])}};
+  normal = direction(Vector<S, 2>{{edge[1], S(0) - edge[0]}});
+  const T size = value_of(length(edge)), along = size > T(0) ? value_of(dot(arm, edge)) / size : T(0);
+  beyond = along < T(0) ? T(0) - along : along > size ? along - size : T(0);
+  if (size == T(0) || (a[0] == T(0) && b[0] == T(0))) return S(std::numeric_limits<T>::max());
+  return dot(arm, normal);
 }
 
 // Signed distance of a point from a closed polygon, and the outward normal of its nearest edge; among equals, the first
-// counts. `second` is the distance of the edge that is nearest but for this one. Inside it is the depth where another
-// edge or corner is nearly as deep (grid/solid.h has the depth of corners), and otherwise the way by the nearest point
-// of the polygon. So the other side of a thin wall is far.
+// counts. `second` is the distance of the edge that is nearest but for this one. Inside it is the depth and how far
+// another edge is from joining the nearest one (grid/solid.h): the way from the nearest point of the polygon to that
+// edge, or the height of the point above its line where it is not deeper below that. So the other side of a thin wall
+// is far.
 template <class S>
 MPM_HD S polygon_surface(const ValueOf<S>* corner, int corners, const Vector<S, 2>& p, Vector<S, 2>& normal,
                          ValueOf<S>& second) {
@@ -78,31 +84,14 @@ MPM_HD S polygon_surface(const ValueOf<S>* corner, int corners, const Vector<S, 
   for (int k = 0; k < corners; k++) {
     const T *const a = corner + 2 * k, *const b = end_of_edge(corner, corners, k);
     if (k == first || (a[0] == T(0) && b[0] == T(0))) continue;
-    if (is_nearly_as_deep(a, b, point, depth)) {
-      second = depth;
-      return S(0) - nearest;
-    }
-    const T distance = length(offset_from_edge(a, b, foot));
-    if (distance < gap) gap = distance;
+    T way = length(offset_from_edge(a, b, foot)), beyond;
+    Vector<T, 2> across;
+    const T height = edge_height(corner, corners, k, point, across, beyond);
+    if (height >= T(-1.001) * depth && height < way) way = height > T(0) ? height : T(0);
+    if (way < gap) gap = way;
   }
   second = depth + gap;
   return S(0) - nearest;
-}
-
-// Height of a point (distance from the axis, position along it) above the line of edge k of a polygon; `beyond` is how
-// far the foot of the point is beyond the ends of the edge. Far above where the edge is on the axis, inside the body.
-template <class S>
-MPM_HD S edge_height(const ValueOf<S>* corner, int corners, int k, const Vector<S, 2>& p, Vector<S, 2>& normal,
-                     ValueOf<S>& beyond) {
-  using T = ValueOf<S>;
-  const T *const a = corner + 2 * k, *const b = end_of_edge(corner, corners, k);
-  const Vector<S, 2> edge = {{lift<S>(b[0] - a[0]), lift<S>(b[1] - a[1])}};
-  const Vector<S, 2> arm = {{p[0] - lift<S>(a[0]), p[1] - lift<S>(a[1])}};
-  normal = direction(Vector<S, 2>{{edge[1], S(0) - edge[0]}});
-  const T size = value_of(length(edge)), along = size > T(0) ? value_of(dot(arm, edge)) / size : T(0);
-  beyond = along < T(0) ? T(0) - along : along > size ? along - size : T(0);
-  if (size == T(0) || (a[0] == T(0) && b[0] == T(0))) return S(std::numeric_limits<T>::max());
-  return dot(arm, normal);
 }
 
 // Signed distance by multilinear interpolation of samples, and the direction of its gradient; beyond the samples the

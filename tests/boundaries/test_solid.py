@@ -554,6 +554,32 @@ def test_the_kernel_is_what_torch_operations_are(device, dim, dtype, walls):
     assert met > 90 and differs <= met // 500
 
 
+def any_outline(random: torch.Generator) -> list[tuple[float, float]]:
+    """A star around a point, beside the axis or on it with flat ends."""
+    count = int(torch.randint(5, 12, (), generator=random))
+    radii = (0.15 + 0.6 * torch.rand(count, generator=random, dtype=torch.float64)).tolist()
+    if count % 2:
+        return [(0.8 + r * math.cos(t), r * math.sin(t)) for i, r in enumerate(radii) for t in [2 * math.pi * i / count]]
+    turns = [math.pi * (i / (count - 1) - 0.5) for i in range(count)]
+    corners = [(r * math.cos(t), r * math.sin(t)) for r, t in zip(radii, turns, strict=True)]
+    return [(0.0, corners[1][1]), *corners[1:-1], (0.0, corners[-2][1])]
+
+
+def test_nodes_in_an_outline_meet_all_its_faces_that_join(device, dim):
+    """Faces of which a node is as deep below the lines, though their edges and corners are farther away."""
+    grid = mpm.Grid(0.1, (-2.0,) * dim, (2.0,) * dim)
+    blocks = grid.activate(torch.rand(4000, dim, dtype=torch.float64, device=device) * 3 - 1.5)
+    random = torch.Generator().manual_seed(3)
+    for seed in range(30 if dim == 2 else 6):
+        turn = torch.randn((3,) if dim == 3 else (), generator=random, dtype=torch.float64).tolist()
+        shape = shapes.Revolved(any_outline(random), ([0.0] * (dim - 1) + [1.0]))
+        obstacle = Obstacle(shape, [0.0037 + 0.02 * seed] * dim, "slip", rotation=turn)
+        velocity = torch.randn(blocks.node_count, dim, dtype=torch.float64, device=device)
+        after, expected = contact(blocks, velocity, [obstacle], 0.0), in_torch(blocks, velocity, [obstacle])
+        active = blocks.active_nodes()
+        torch.testing.assert_close(after[active], expected[active], rtol=0, atol=1e-9)
+
+
 @pytest.mark.parametrize("kind", ["separate", "slip", "sticky"])
 def test_impulses_of_corners_add_up_to_the_change_of_momentum(device, dim, kind):
     grid = mpm.Grid(0.12, (0.0,) * dim, (0.9,) * dim)
