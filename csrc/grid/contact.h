@@ -143,7 +143,7 @@ class NearestSurface {
 
   const ContactArguments<T, D>& a_;
   const Vector<T, D> position_;
-  const T farthest_;  // distance of the surfaces that count
+  const T farthest_;                           // distance of the surfaces that count
   T nearest_ = std::numeric_limits<T>::max();  // distance of the nearest obstacle
   T own_ = nearest_, second_ = nearest_;       // of its second face, see `surface`; of the next obstacle
   NodeTouch<T, D> touch_;
