@@ -83,12 +83,12 @@ struct LoneContact {
   MPM_HD Vector<double, D> impulse() const { return as_double((T(0) - node.mass) * change()); }
 
   // Derivative of a component of the impulse by the velocity of the surface.
-  MPM_HD Vector<double, D> slope(int axis) const {
+  MPM_HD Vector<T, D> slope(int axis) const {
     Vector<T, D> unit;
     MPM_UNROLL for (int i = 0; i < D; i++)
       unit[i] = T(i == axis);
     const Vector<T, D> kept = contact_adjoint(pose.contact, u, node.normal, pose.row->friction, unit);
-    return as_double(node.mass * (kept + T(-1) * unit));
+    return node.mass * (kept + T(-1) * unit);
   }
 };
 
@@ -101,9 +101,21 @@ MPM_HD LoneNode<T, D> lone_node(const ContactArguments<T, D>& a, const T* veloci
 
 // ---- nodes that meet any surfaces
 
+// An active slot of a scene, by the poses of the obstacles of its bodies.
+template <class T, int D>
+MPM_HD ContactSlot<T, D> slot_of_bodies(const ContactArguments<T, D>& a, const ObstaclePose<T, D>* poses, int scene,
+                                        const int (&corner)[D]) {
+  ContactSlot<T, D> s;
+  s.active = true, s.scene = scene, s.row = poses->row;
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    s.corner[i] = corner[i];
+  find_near(a, [&](int k) -> const ObstaclePose<T, D>& { return poses[k]; }, NoVisit(), s);
+  return s;
+}
+
 // Sets the surfaces that a node meets. By all threads of a warp, as `any_of_warp`.
 template <class T, int D>
-MPM_HD_CALL void set_body_node(bool wanted, const SlotPoses<T, D>& poses, const NodeContact<T, D>& contact, int node,
+MPM_HD_CALL void set_body_node(bool wanted, const StoredPoses<T, D>& poses, const NodeContact<T, D>& contact, int node,
                                int local, BodyNode<T, D>& result) {
   if (!wanted) return;
   result.node = node;
@@ -204,18 +216,28 @@ MPM_HD Vector<double, D> arm_from(const BodyNow<D>& b, const Vector<double, D>& 
   return x + -1.0 * b.position;
 }
 
+template <class T, int D>
+MPM_HD Vector<T, D> rounded_arm_from(const BodyNow<D>& b, const Vector<double, D>& x) {
+  const Vector<double, D> arm = arm_from(b, x);
+  Vector<T, D> r;
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    r[i] = T(arm[i]);
+  return r;
+}
+
 // Derivative of an impulse at arm `at` along the motions i of a body, by the motions j of a body at arm `by`, as number
-// i n + j; `slope(axis)` is that of a component by the velocity there.
-template <int D, class Slope>
-MPM_HD void set_slope_block(const Slope& slope, const Vector<double, D>& at, const Vector<double, D>& by,
-                            double (&block)[kMotions<D> * kMotions<D>]) {
+// i n + j; `slope(axis)` is that of a component by the velocity there. The type of the nodes suffices: rounding of
+// derivatives changes how Newton's method gets to the solution, and gradients, but no momentum.
+template <class T, int D, class Slope>
+MPM_HD void set_slope_block(const Slope& slope, const Vector<T, D>& at, const Vector<T, D>& by,
+                            T (&block)[kMotions<D> * kMotions<D>]) {
   constexpr int n = kMotions<D>;
-  double rows[D][n];
-  MPM_LOOP for (int axis = 0; axis < D; axis++)
+  T rows[D][n];
+  MPM_UNROLL for (int axis = 0; axis < D; axis++)
     set_along_motions(by, slope(axis), rows[axis]);
   MPM_UNROLL for (int j = 0; j < n; j++) {
-    Vector<double, D> column;
-    double along[n];
+    Vector<T, D> column;
+    T along[n];
     MPM_UNROLL for (int axis = 0; axis < D; axis++)
       column[axis] = rows[axis][j];
     set_along_motions(at, column, along);
@@ -228,9 +250,9 @@ MPM_HD void set_slope_block(const Slope& slope, const Vector<double, D>& at, con
 template <class T, int D>
 MPM_HD auto slope_by_axis(const PushSlope<T, D>& slope, int face, int by_axis) {
   return [&slope, face, by_axis](int axis) {
-    Vector<double, D> row;
+    Vector<T, D> row;
     MPM_UNROLL for (int i = 0; i < D; i++)
-      row[i] = i == by_axis ? double(slope.of[face][axis]) : 0;
+      row[i] = i == by_axis ? slope.of[face][axis] : T(0);
     return row;
   };
 }

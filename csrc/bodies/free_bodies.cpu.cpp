@@ -1,10 +1,8 @@
 #include "bodies/free_bodies.h"
 
 #include <algorithm>
-#include <optional>
 #include <vector>
 
-#include "bodies/near_parts.h"
 #include "cpu/parallel.h"
 
 namespace mpm::cpu {
@@ -45,11 +43,9 @@ struct OneThread {
     for (const LoneNode<T, D>& node : nodes.lone) {
       const LoneContact<T, D> contact(a.contact, scene.poses, node);
       const int k = a.owner[node.obstacle];
-      const auto at = arm_from(scene.now[k], contact.at);
-      if (impulses) add_impulse(at, contact.impulse(), impulses + k * n);
-      if (slopes)
-        add_slopes([&](int axis) { return contact.slope(axis); }, at, arm_from(scene.now[k], contact.position), k, k,
-                   slopes);
+      if (impulses) add_impulse(arm_from(scene.now[k], contact.at), contact.impulse(), impulses + k * n);
+      const auto arm = rounded_arm_from<T>(scene.now[k], contact.at);
+      if (slopes) add_slopes([&](int axis) { return contact.slope(axis); }, arm, arm, k, k, slopes);
     }
     each_other(scene, [&](const BodyNode<T, D>& node, const T& mass, const Vector<T, D>& v) {
       NodePush<T, D> push{};
@@ -112,25 +108,25 @@ struct OneThread {
     const int l = a.owner[push.obstacle[by]];
     for (int face = 0; face < push.faces; face++) {
       const int k = a.owner[push.obstacle[face]];
-      add_slopes(slope_by_axis(slope, face, axis), arm_from(scene.now[k], push.at),
-                 arm_from(scene.now[l], push.position), k, l, sums);
+      add_slopes(slope_by_axis(slope, face, axis), rounded_arm_from<T>(scene.now[k], push.at),
+                 rounded_arm_from<T>(scene.now[l], push.position), k, l, sums);
     }
   }
 
   template <class Slope>
-  void add_slopes(const Slope& slope, const Vector<double, D>& at, const Vector<double, D>& by, int k, int l,
+  void add_slopes(const Slope& slope, const Vector<T, D>& at, const Vector<T, D>& by, int k, int l,
                   double* sums) const {
     const int m = a.bodies * n;
-    double block[n * n];
+    T block[n * n];
     set_slope_block(slope, at, by, block);
     MPM_UNROLL for (int i = 0; i < n; i++) MPM_UNROLL
-      for (int j = 0; j < n; j++) sums[(k * n + i) * m + l * n + j] += block[i * n + j];
+      for (int j = 0; j < n; j++) sums[(k * n + i) * m + l * n + j] += double(block[i * n + j]);
   }
 };
 
 // Adds a node of a slot that may meet several surfaces.
 template <class T, int D>
-void add_node(const FreeBodiesArguments<T, D>& a, const SlotPoses<T, D>& poses, int slot, int local,
+void add_node(const FreeBodiesArguments<T, D>& a, const StoredPoses<T, D>& poses, int slot, int local,
               SceneNodes<T, D>& nodes) {
   NodeContact<T, D> contact;
   find_surfaces(true, poses, node_position(a.contact, poses.s.corner, local), contact);
@@ -144,10 +140,10 @@ void add_node(const FreeBodiesArguments<T, D>& a, const SlotPoses<T, D>& poses, 
     nodes.others.push_back(node);
 }
 
-// Finds the nodes of a slot that are in contact. `placed` has the rows of the obstacles as they are in this step.
+// Finds the nodes of a slot that are in contact, by the poses of the obstacles of all scenes.
 template <class T, int D>
-void find_nodes(const FreeBodiesArguments<T, D>& a, const ContactArguments<T, D>& placed,
-                const ObstaclePose<T, D>* poses, int slot, SceneNodes<T, D>& nodes) {
+void find_nodes(const FreeBodiesArguments<T, D>& a, const ObstaclePose<T, D>* poses, int slot,
+                SceneNodes<T, D>& nodes) {
   const int first = slot * kBlockNodes<D>;
   bool any = false;
   for (int local = 0; local < kBlockNodes<D>; local++) any |= has_mass(a.contact, first + local);
@@ -157,18 +153,16 @@ void find_nodes(const FreeBodiesArguments<T, D>& a, const ContactArguments<T, D>
   if (block < 0 || scene >= a.scenes) return;
   for (int& i : corner) i *= kBlockWidth;
   poses += int64_t(scene) * a.contact.obstacles;
-  const NearParts parts = near_parts(a.contact, poses, corner);
-  std::optional<SlotPoses<T, D>> of_slot;
-  if (parts.near) nodes.lone.reserve(kBlockNodes<D>);
-  for (int local = 0; local < kBlockNodes<D> && parts.near; local++) {
+  const ContactSlot<T, D> near = slot_of_bodies(a.contact, poses, scene, corner);
+  const StoredPoses<T, D> of_slot(a.contact, near, poses);
+  if (near.near) nodes.lone.reserve(kBlockNodes<D>);
+  for (int local = 0; local < kBlockNodes<D> && near.near; local++) {
     if (!has_mass(a.contact, first + local)) continue;
-    const NodeTouch<T, D> touch = touch_of_parts(a.contact, poses, parts, node_position(a.contact, corner, local));
+    const NodeTouch<T, D> touch = touch_of_node<true>(of_slot, node_position(a.contact, corner, local));
     if (touch.obstacle >= 0)
       nodes.lone.push_back(lone_node(a.contact, a.velocity, a.stride, first + local, lattice_node<D>(corner, local),
                                      touch.obstacle, touch.normal));
-    if (touch.obstacle != touch.several) continue;
-    if (!of_slot) of_slot.emplace(placed, slot);
-    add_node(a, *of_slot, slot, local, nodes);
+    if (touch.obstacle == touch.several) add_node(a, of_slot, slot, local, nodes);
   }
 }
 
@@ -199,14 +193,10 @@ void free_bodies(const FreeBodiesArguments<T, D>& a) {
     for (int64_t scene = begin; scene < end; scene++)
       Bodies::begin(a, int(scene), memory_of(scene), teams[size_t(scene)]);
   });
-  ContactArguments<T, D> placed = a.contact;
-  placed.row = rows.data();
-  placed.rows = a.scenes;
   const int slots = a.contact.max_blocks;
   std::vector<SceneNodes<T, D>> of_slot{size_t(slots)};
   parallel_ranges(slots, kGrain, [&](int64_t begin, int64_t end) {
-    for (int64_t slot = begin; slot < end; slot++)
-      find_nodes(a, placed, poses.data(), int(slot), of_slot[size_t(slot)]);
+    for (int64_t slot = begin; slot < end; slot++) find_nodes(a, poses.data(), int(slot), of_slot[size_t(slot)]);
   });
   for (int slot = 0; slot < slots; slot++) {
     const SceneNodes<T, D>& found = of_slot[size_t(slot)];

@@ -1,6 +1,5 @@
 #include "bodies/free_bodies.h"
 
-#include "bodies/near_parts.h"
 #include "bodies/warp_sums.cuh"
 #include "cuda/programmatic_launch.cuh"
 
@@ -20,10 +19,10 @@ template <int D>
 constexpr int kLoneRoom = D == 2 ? 8 : 16;  // the same of nodes that meet one surface
 constexpr int64_t kMostShared = 1 << 15;    // bytes of a scene's bodies and numbers, and of its sums, in shared memory
 
-template <int D>
+template <class T, int D>
 struct NearSlot {
-  int slot, corner[D];
-  NearParts parts;
+  int number;
+  ContactSlot<T, D> slot;
 };
 
 // The slots of a scene, first those with particles and then those of the margin.
@@ -46,7 +45,7 @@ int threads_of(const FreeBodiesArguments<T, D>& a) {
 // The work space in global memory. A scene has its part of each array.
 template <class T, int D>
 struct BodiesMemory {
-  NearSlot<D>* near;      // [slots]
+  NearSlot<T, D>* near;   // [slots]
   int* list;              // [slots * kBlockNodes] nodes of a scene as `node_of` has them
   BodyNode<T, D>* nodes;  // [slots * kRoom]
   LoneNode<T, D>* lone;   // [slots * kLoneRoom + scenes * threads]
@@ -136,7 +135,7 @@ struct BlockTeam {
   const int scene;
   const SceneMemory<T, D>& memory;
   // Of the scene, as BodiesMemory has them.
-  NearSlot<D>* near;
+  NearSlot<T, D>* near;
   int* list;
   BodyNode<T, D>* nodes;
   LoneNode<T, D>* lone;
@@ -183,15 +182,16 @@ struct BlockTeam {
     const int all = slots.total();
     for (int first = 0; first < all; first += kThreads) {
       const int i = first + int(threadIdx.x);
-      NearSlot<D> found;
+      NearSlot<T, D> found;
       if (i < all) {
-        found.slot = slots[i];
-        block_coordinates(a.contact.geometry, a.contact.block[found.slot], found.corner);
+        found.number = slots[i];
+        int corner[D];
+        block_coordinates(a.contact.geometry, a.contact.block[found.number], corner);
 #pragma unroll
-        for (int k = 0; k < D; k++) found.corner[k] *= kBlockWidth;
-        found.parts = near_parts(a.contact, memory.poses, found.corner);
+        for (int k = 0; k < D; k++) corner[k] *= kBlockWidth;
+        found.slot = slot_of_bodies(a.contact, memory.poses, scene, corner);
       }
-      const bool is_near = i < all && found.parts.near;
+      const bool is_near = i < all && found.slot.near;
       const int at = place(is_near, near_count);
       if (is_near) near[at] = found;
     }
@@ -199,9 +199,10 @@ struct BlockTeam {
   }
 
   // A node of the list: number of a near slot times kBlockNodes, and number in the block.
-  __device__ const NearSlot<D>& slot_of(int entry) const { return near[entry / kBlockNodes<D>]; }
+  __device__ const NearSlot<T, D>& near_of(int entry) const { return near[entry / kBlockNodes<D>]; }
+  __device__ StoredPoses<T, D> poses_of(int entry) const { return {a.contact, near_of(entry).slot, memory.poses}; }
   __device__ static int local_of(int entry) { return entry % kBlockNodes<D>; }
-  __device__ int node_of(int entry) const { return slot_of(entry).slot * kBlockNodes<D> + local_of(entry); }
+  __device__ int node_of(int entry) const { return near_of(entry).number * kBlockNodes<D> + local_of(entry); }
 
   // Lists the nodes in contact, and stores what they meet, as far as there is room.
   __device__ void find_nodes() {
@@ -256,7 +257,7 @@ struct BlockTeam {
     const int at = place(wanted, lone_count);
     if (wanted)
       lone[at] = lone_node(a.contact, a.velocity, a.stride, node_of(entry),
-                           lattice_node<D>(slot_of(entry).corner, local_of(entry)), obstacle, normal);
+                           lattice_node<D>(near_of(entry).slot.corner, local_of(entry)), obstacle, normal);
     return false;
   }
 
@@ -281,8 +282,8 @@ struct BlockTeam {
 
   __device__ __noinline__ void find_touch_of(bool wanted, int entry, NodeTouch<T, D>& touch) const {
     if (!wanted) return;
-    const NearSlot<D>& slot = slot_of(entry);
-    touch = touch_of_parts(a.contact, memory.poses, slot.parts, node_position(a.contact, slot.corner, local_of(entry)));
+    const StoredPoses<T, D> poses = poses_of(entry);
+    touch = touch_of_node<true>(poses, node_position(a.contact, poses.s.corner, local_of(entry)));
   }
 
   // The surfaces of a node, if it meets any; `several` where it is known that it may meet several. By all threads of a
@@ -294,20 +295,16 @@ struct BlockTeam {
       find_touch_of(touches, entry, touch);
       join_warp();
     }
-    const NearSlot<D>& slot = slot_of(entry);
-    ContactSlot<T, D> s{true, slot.parts.walled, scene, {}, slot.parts.near, slot.parts.touching, memory.rows};
-#pragma unroll
-    for (int i = 0; i < D; i++) s.corner[i] = slot.corner[i];
-    const SlotPoses<T, D> poses(a.contact, s);
+    const StoredPoses<T, D> poses = poses_of(entry);
     const int local = local_of(entry);
-    const Vector<T, D> position = node_position(a.contact, s.corner, local);
+    const Vector<T, D> position = node_position(a.contact, poses.s.corner, local);
     NodeContact<T, D> contact;
     several = wanted && (several || touch.obstacle == touch.several);
     if (any_of_warp(several)) {
       find_surfaces(several, poses, position, contact);
       join_warp();
     }
-    if (touch.obstacle >= 0) meet_alone(a.contact, memory.poses, touch.obstacle, position, contact);
+    if (touch.obstacle >= 0) meet_alone(poses, touch.obstacle, position, contact);
     const bool meets = wanted && contact.count > 0;
     if (any_of_warp(meets)) {
       set_body_node(meets, poses, contact, node_of(entry), local, result);
@@ -370,44 +367,52 @@ struct BlockTeam {
   }
 
   __device__ void add_nodes(int warp, double* impulses, double* slopes) const {
+    const auto impulse_of = [&](int body, int e) { return impulses + (body * n + e); };
+    SumsByKey<n, double, decltype(impulse_of)> of_impulses(impulse_of);
+    const int m = a.bodies * n;
+    const auto slope_of = [&](int pair, int e) {
+      return slopes + (int64_t((pair >> 8) * n + e / n) * m + (pair & 255) * n + e % n);
+    };
+    SumsByKey<n * n, T, decltype(slope_of)> of_slopes(slope_of);
     constexpr int tile = 32, seeded = 32 / (D * D);  // nodes of a warp
     for (int first = warp * tile; first < lone_count; first += adders * tile)
-      add_lone_nodes(first + lane(), impulses, slopes);
+      add_lone_node(first + lane(), impulses, of_impulses, slopes, of_slopes);
     for (int first = warp * tile; impulses && first < count; first += adders * tile)
-      add_impulses(first + lane(), impulses);
+      add_impulses(first + lane(), of_impulses);
     const int node = lane() / (D * D);  // the last lanes have none
     for (int first = warp * seeded; slopes && first < count; first += adders * seeded)
-      add_slopes(node < seeded ? first + node : count, lane() % (D * D), slopes);
+      add_slopes(node < seeded ? first + node : count, lane() % (D * D), of_slopes);
+    of_impulses.finish();
+    of_slopes.finish();
   }
 
-  __device__ void add_lone_nodes(int i, double* impulses, double* slopes) const {
+  // A pair of bodies as a key of sums; negative where a body is.
+  __device__ static int pair_of(int k, int l) {
+    static_assert(kMaxObstacles <= 256);
+    return k < 0 ? -1 : k << 8 | l;
+  }
+
+  template <class Impulses, class Slopes>
+  __device__ void add_lone_node(int i, bool wants_impulses, Impulses& impulses, bool wants_slopes,
+                                Slopes& slopes) const {
     int k = -1;
-    double along[n], block[n * n];
+    double along[n];
+    T block[n * n];
     if (i < lone_count) {
       const LoneNode<T, D> node = lone[i];
       const LoneContact<T, D> contact(a.contact, memory.poses, node);
       k = a.owner[node.obstacle];
-      const Vector<double, D> at = arm_from(memory.now[k], contact.at);
-      set_along_motions(at, contact.impulse(), along);
-      if (slopes)
-        set_slope_block([&](int axis) { return contact.slope(axis); }, at, arm_from(memory.now[k], contact.position),
-                        block);
+      set_along_motions(arm_from(memory.now[k], contact.at), contact.impulse(), along);
+      const Vector<T, D> arm = rounded_arm_from<T>(memory.now[k], contact.at);
+      if (wants_slopes) set_slope_block([&](int axis) { return contact.slope(axis); }, arm, arm, block);
     }
-    if (impulses) add_by_key(k, along, [&](int body, int e) { return impulses + (body * n + e); });
-    if (slopes) add_block(k, k, block, slopes);
-  }
-
-  // Adds blocks of lanes for the bodies k and l, negative where there is none.
-  __device__ void add_block(int k, int l, const double (&block)[n * n], double* slopes) const {
-    static_assert(kMaxObstacles <= 256);
-    const int m = a.bodies * n;
-    add_by_key(k < 0 ? -1 : k << 8 | l, block, [&](int pair, int e) {
-      return slopes + (int64_t((pair >> 8) * n + e / n) * m + (pair & 255) * n + e % n);
-    });
+    if (wants_impulses) impulses.add(k, along);
+    if (wants_slopes) slopes.add(pair_of(k, k), block);
   }
 
   // Impulses on the faces of a node.
-  __device__ void add_impulses(int i, double* sums) const {
+  template <class Sums>
+  __device__ void add_impulses(int i, Sums& sums) const {
     const bool wanted = i < count;
     BodyNode<T, D> node;
     NodePush<T, D> push;
@@ -432,12 +437,13 @@ struct BlockTeam {
         for (int axis = 0; axis < D; axis++) impulse[axis] = double(push.impulse[face][axis]);
         set_along_motions(arm_from(memory.now[k], push.at), impulse, along);
       }
-      add_by_key(k, along, [&](int body, int e) { return sums + (body * n + e); });
+      sums.add(k, along);
     }
   }
 
   // Derivatives of the impulses on the faces of a node by the velocity of face `seed / D` along axis `seed % D`.
-  __device__ void add_slopes(int i, int seed, double* sums) const {
+  template <class Sums>
+  __device__ void add_slopes(int i, int seed, Sums& sums) const {
     const bool wanted = i < count;
     BodyNode<T, D> node;
     NodePush<T, D> push;
@@ -456,11 +462,11 @@ struct BlockTeam {
     const int l = acts ? a.owner[push.obstacle[by]] : -1;
     MPM_LOOP for (int face = 0; face < D; face++) {
       const int k = acts && face < push.faces ? a.owner[push.obstacle[face]] : -1;
-      double block[n * n];
+      T block[n * n];
       if (k >= 0)
-        set_slope_block(slope_by_axis(slope, face, axis), arm_from(memory.now[k], push.at),
-                        arm_from(memory.now[l], push.position), block);
-      add_block(k, l, block, sums);
+        set_slope_block(slope_by_axis(slope, face, axis), rounded_arm_from<T>(memory.now[k], push.at),
+                        rounded_arm_from<T>(memory.now[l], push.position), block);
+      sums.add(pair_of(k, l), block);
     }
   }
 

@@ -109,8 +109,8 @@ MPM_HD Vector<double, D> motion_at(const double* motion, const Vector<double, D>
 }
 
 // A vector at an arm, along each number of a motion: its components, followed by its moment.
-template <int D>
-MPM_HD void set_along_motions(const Vector<double, D>& arm, const Vector<double, D>& v, double (&along)[kMotions<D>]) {
+template <class S, int D>
+MPM_HD void set_along_motions(const Vector<S, D>& arm, const Vector<S, D>& v, S (&along)[kMotions<D>]) {
   MPM_UNROLL for (int i = 0; i < D; i++)
     along[i] = v[i];
   MPM_UNROLL for (int i = 0; i < kTurns<D>; i++) {

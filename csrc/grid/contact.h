@@ -116,10 +116,10 @@ class NearestSurface {
  private:
   // How far the point beside a wall is, from which `find_surfaces` looks into gaps. Samples of distances have slopes up
   // to √D.
-  MPM_HD static T beside_wall(const ContactArguments<T, D>& a) { return T(1.001 * D) * SolidAt<T, D>::seam_of(a); }
+  MPM_HD static T beside_wall(const ContactArguments<T, D>& a) { return T(1.001 * D) * seam_of(a); }
 
   // Faces of the same obstacle and walls within this distance may join the nearest surface.
-  MPM_HD T away() const { return 2 * SolidAt<T, D>::seam_of(a_) - nearest_; }
+  MPM_HD T away() const { return 2 * seam_of(a_) - nearest_; }
 
   // Whether another face may join the nearest surface at an edge. The edge between two obstacles with an angle α is
   // 1/sin(α/2) times as far from a node as that is deep, twice for 60 degrees.
@@ -153,8 +153,8 @@ class NearestSurface {
 
 // The least deep obstacle that a position is in, −1 for none. Of equally deep ones the stricter counts, and then that
 // of more friction, as `SolidAt` has it.
-template <class T, int D>
-MPM_HD int obstacle_around(bool wanted, const SlotPoses<T, D>& poses, const Vector<T, D>& x) {
+template <class Poses, class T, int D>
+MPM_HD int obstacle_around(bool wanted, const Poses& poses, const Vector<T, D>& x) {
   const auto& a = poses.a;
   int found = -1;
   T least = T(0);
@@ -177,10 +177,10 @@ MPM_HD int obstacle_around(bool wanted, const SlotPoses<T, D>& poses, const Vect
 }
 
 // Adds the faces that a node inside obstacle `inside` meets; a negative one adds none.
-template <class T, int D>
-MPM_HD void find_in_solid(const SlotPoses<T, D>& poses, int inside, NodeContact<T, D>& c) {
+template <class Poses, class T, int D>
+MPM_HD void find_in_solid(const Poses& poses, int inside, NodeContact<T, D>& c) {
   const auto& a = poses.a;
-  SolidAt<T, D> solid(poses, c.position);
+  SolidAt<Poses, T, D> solid(poses, c.position);
   solid.find(inside >= 0);
   const auto& foot = solid.foot();
   MPM_LOOP for (int i = 0; i < foot.count; i++) {
@@ -191,9 +191,8 @@ MPM_HD void find_in_solid(const SlotPoses<T, D>& poses, int inside, NodeContact<
   if (inside >= 0 && foot.count == 0) c.add(inside, -1, c.position);  // deep inside
 }
 
-template <class T, int D>
-MPM_HD_CALL void find_surfaces(bool wanted, const SlotPoses<T, D>& poses, const Vector<T, D>& position,
-                               NodeContact<T, D>& c) {
+template <class Poses, class T, int D>
+MPM_HD_CALL void find_surfaces(bool wanted, const Poses& poses, const Vector<T, D>& position, NodeContact<T, D>& c) {
   const auto& a = poses.a;
   c.position = within_walls(a, position, T(0), c.sign);
   int around = obstacle_around(wanted, poses, c.position);
@@ -204,7 +203,7 @@ MPM_HD_CALL void find_surfaces(bool wanted, const SlotPoses<T, D>& poses, const 
   const bool in_gap = wanted && around < 0 && c.walls;  // between an obstacle and a wall
   if (any_of_warp(in_gap)) {
     Vector<T, D> sign;
-    const Vector<T, D> beside = within_walls(a, position, SolidAt<T, D>::seam_of(a), sign);
+    const Vector<T, D> beside = within_walls(a, position, seam_of(a), sign);
     const int there = obstacle_around(in_gap, poses, beside);
     if (there >= 0) around = there, c.position = beside;
   }
@@ -214,19 +213,29 @@ MPM_HD_CALL void find_surfaces(bool wanted, const SlotPoses<T, D>& poses, const 
 // ---- any node
 
 // `Exact`: a node at a wall always meets several surfaces, whose derivatives are those of the walls, too.
-template <bool Exact = false, class T, int D>
-MPM_HD NodeTouch<T, D> touch_of_node(const SlotPoses<T, D>& poses, const Vector<T, D>& position) {
+template <bool Exact = false, class Poses, class T, int D>
+MPM_HD NodeTouch<T, D> touch_of_node(const Poses& poses, const Vector<T, D>& position) {
   if (poses.s.near == 0) return {};
   Vector<T, D> sign = zero_vector<T, D>();
   const bool at_wall =
       !Exact && poses.s.walled && nearest_wall(poses.a, position) <= NearestSurface<T, D>::near_wall(poses.a);
   NearestSurface<T, D> nearest(poses.a, at_wall ? within_walls(poses.a, position, T(0), sign) : position, at_wall);
-  const auto visit = [&](uint64_t obstacles) {
-    for (uint64_t left = obstacles; left; left &= left - 1) nearest(lowest_bit(left), poses[lowest_bit(left)]);
-  };
-  visit(poses.s.touching);
-  if (at_wall || nearest.is_inside()) visit(poses.s.near & ~poses.s.touching);
+  uint64_t left = poses.s.touching, others = poses.s.near & ~left;
+  MPM_LOOP while (left) {
+    nearest(lowest_bit(left), poses[lowest_bit(left)]);
+    left &= left - 1;
+    if (!left && (at_wall || nearest.is_inside())) left = others, others = 0;
+  }
   return at_wall ? nearest.at_wall(sign) : nearest.found(poses.s.walled);
+}
+
+// The contact of a node that meets the surface of one obstacle, or none if k is negative.
+template <class Poses, class T, int D>
+MPM_HD void meet_alone(const Poses& poses, int k, const Vector<T, D>& position, NodeContact<T, D>& c) {
+  c.position = position;
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    c.sign[i] = T(1);
+  if (k >= 0) c.add(k, nearest_face(poses.a, poses[k], to_body(poses[k], position)), position);
 }
 
 // Finds the surfaces that a node at a position meets; `c` has none yet. By all threads of a warp, as `any_of_warp`.
@@ -240,11 +249,7 @@ MPM_HD void find_contact(bool wanted, const SlotPoses<T, D>& poses, const Vector
     find_surfaces(several, poses, position, c);
     join_warp();
   }
-  if (several) return;
-  c.position = position;
-  MPM_UNROLL for (int i = 0; i < D; i++)
-    c.sign[i] = T(1);
-  if (k >= 0) c.add(k, nearest_face(poses.a, poses[k], to_body(poses[k], position)), position);
+  if (!several) meet_alone(poses, k, position, c);
 }
 
 // Adds that of face i of a contact, whose obstacle has the given pose.
@@ -289,8 +294,8 @@ MPM_HD void add_walls(const ContactArguments<T, D>& a, const NodeContact<T, D>& 
   }
 }
 
-template <class T, int D>
-MPM_HD void find_constraints(const SlotPoses<T, D>& poses, const NodeContact<T, D>& contact, Constraints<T, D>& c) {
+template <class Poses, class T, int D>
+MPM_HD void find_constraints(const Poses& poses, const NodeContact<T, D>& contact, Constraints<T, D>& c) {
   c.count = 0;
   MPM_LOOP for (int i = 0; i < contact.count; i++)
     add_face(poses[contact.obstacle[i]], contact, i, c);

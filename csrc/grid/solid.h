@@ -105,20 +105,13 @@ MPM_HD bool is_walled(const ContactArguments<T, D>& a, const int (&corner)[D]) {
   return nearest_wall(a, middle_of_block(a, corner)) <= half_of_block(a) + T(kReach * a.dx);
 }
 
-// Of an active block of a scene, with the lattice index of its first node. Calls visit(k, pose) for each obstacle that
-// is near: that may touch a node of the block or, beside others, have faces within reach of one. Distances change by no
-// more than the way from a point to another; samples of distances do so between the nodes of their lattice, so that the
-// slope of their multilinear interpolant is at most 1 along each axis.
-template <class T, int D, class Visit = NoVisit>
-MPM_HD ContactSlot<T, D> contact_slot(const ContactArguments<T, D>& a, int scene, const int (&corner)[D],
-                                      Visit&& visit = {}) {
-  ContactSlot<T, D> s;
-  s.scene = scene;
-  s.active = acts_in(a, scene);
-  s.row = rows_of_scene(a, scene);
-  MPM_UNROLL for (int i = 0; i < D; i++)
-    s.corner[i] = corner[i];
-  if (!s.active) return s;
+// Sets which obstacles are near an active slot, by `pose_of(k)`, and calls visit(k, pose) for each of these: that may
+// touch a node of the block or, beside others, have faces within reach of one. Distances change by no more than the way
+// from a point to another; samples of distances do so between the nodes of their lattice, so that the slope of their
+// multilinear interpolant is at most 1 along each axis.
+template <class T, int D, class PoseOf, class Visit>
+MPM_HD void find_near(const ContactArguments<T, D>& a, const PoseOf& pose_of, const Visit& visit,
+                      ContactSlot<T, D>& s) {
   const T half = half_of_block(a);
   Vector<T, D> middle = middle_of_block(a, s.corner), sign;
   s.walled = is_walled(a, s.corner);
@@ -126,7 +119,7 @@ MPM_HD ContactSlot<T, D> contact_slot(const ContactArguments<T, D>& a, int scene
   const T radius = std::sqrt(T(D)) * half * T(1.001) + (s.walled ? T(kSeam * a.dx) : T(0));
   const T margin = a.obstacles > 1 ? T((kReach + kSeam) * a.dx) : T(0);
   for (int k = 0; k < a.obstacles; k++) {
-    const ObstaclePose<T, D> pose = obstacle_pose(a, a.kind[k], s.row[k], scene);
+    const ObstaclePose<T, D>& pose = pose_of(k);
     if (!pose.acts) continue;
     Vector<T, D> normal;
     const T slope = pose.shape == ObstacleShape::sampled ? std::sqrt(T(D)) : T(1);
@@ -137,6 +130,19 @@ MPM_HD ContactSlot<T, D> contact_slot(const ContactArguments<T, D>& a, int scene
     visit(k, pose);
   }
   if (!s.touching) s.near = 0;
+}
+
+// Of a block of a scene, with the lattice index of its first node. `visit` as for `find_near`.
+template <class T, int D, class Visit = NoVisit>
+MPM_HD ContactSlot<T, D> contact_slot(const ContactArguments<T, D>& a, int scene, const int (&corner)[D],
+                                      Visit&& visit = {}) {
+  ContactSlot<T, D> s;
+  s.scene = scene;
+  s.active = acts_in(a, scene);
+  s.row = rows_of_scene(a, scene);
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    s.corner[i] = corner[i];
+  if (s.active) find_near(a, [&](int k) { return obstacle_pose(a, a.kind[k], s.row[k], scene); }, visit, s);
   return s;
 }
 
@@ -188,9 +194,27 @@ class SlotPoses {
 #endif
 };
 
+// The same with stored poses, of all obstacles of the scene.
 template <class T, int D>
-MPM_HD_CALL void compute_height(bool wanted, const SlotPoses<T, D>& poses, int k, int face, const Vector<T, D>& x,
-                                T& height, Vector<T, D>& normal, T& beyond) {
+class StoredPoses {
+ public:
+  const ContactArguments<T, D>& a;
+  const ContactSlot<T, D>& s;
+
+  MPM_HD StoredPoses(const ContactArguments<T, D>& arguments, const ContactSlot<T, D>& slot,
+                     const ObstaclePose<T, D>* poses)
+      : a(arguments), s(slot), pose_(poses) {}
+  MPM_HD const ObstaclePose<T, D>& operator[](int k) const { return pose_[k]; }
+
+ private:
+  const ObstaclePose<T, D>* const pose_;
+};
+
+// Functions below take either as `Poses`.
+
+template <class Poses, class T, int D>
+MPM_HD_CALL void compute_height(bool wanted, const Poses& poses, int k, int face, const Vector<T, D>& x, T& height,
+                                Vector<T, D>& normal, T& beyond) {
   if (!wanted) return;
   const auto& pose = poses[k];
   Vector<T, D> own;
@@ -204,9 +228,9 @@ MPM_HD_CALL void compute_height(bool wanted, const SlotPoses<T, D>& poses, int k
 // The threads of a warp compute heights together, as common/warp.h has it. So all functions from here to the end of the
 // search for surfaces are called by all threads of a warp, with `wanted` for those whose node needs the result. They
 // have no branch around a call but for conditions of `any_of_warp`.
-template <class T, int D>
-MPM_HD T height_above(bool wanted, const SlotPoses<T, D>& poses, int k, int face, const Vector<T, D>& x,
-                      Vector<T, D>& normal, T& beyond) {
+template <class Poses, class T, int D>
+MPM_HD T height_above(bool wanted, const Poses& poses, int k, int face, const Vector<T, D>& x, Vector<T, D>& normal,
+                      T& beyond) {
   T height = T(0);
   if (any_of_warp(wanted)) {
     compute_height(wanted, poses, k, face, x, height, normal, beyond);
@@ -250,18 +274,20 @@ MPM_HD T rounded_depth(const ContactArguments<T, D>& a, const T& depth) {
   return std::floor(depth * (T(1e4) * a.geometry.inverse_dx) + T(0.5));
 }
 
+// `kSeam` as a length [m], at least some roundings.
 template <class T, int D>
+MPM_HD T seam_of(const ContactArguments<T, D>& a) {
+  const T seam = T(kSeam * a.dx);
+  return seam > 4 * a.rounding ? seam : 4 * a.rounding;
+}
+
+template <class Poses, class T, int D>
 class SolidAt {
  public:
   using V = Vector<T, D>;
 
-  MPM_HD SolidAt(const SlotPoses<T, D>& poses, const V& node)
+  MPM_HD SolidAt(const Poses& poses, const V& node)
       : poses_(poses), a_(poses.a), node_(node), seam_(seam_of(poses.a)), reach_(T(kReach * poses.a.dx)) {}
-
-  MPM_HD static T seam_of(const ContactArguments<T, D>& a) {
-    const T seam = T(kSeam * a.dx);
-    return seam > 4 * a.rounding ? seam : 4 * a.rounding;
-  }
 
   // Finds the faces that the node meets; their number is zero where none is near enough.
   MPM_HD void find(bool wanted) {
@@ -674,7 +700,7 @@ class SolidAt {
     return friction;
   }
 
-  const SlotPoses<T, D>& poses_;
+  const Poses& poses_;
   const ContactArguments<T, D>& a_;
   const V node_;
   const T seam_, reach_;
