@@ -71,7 +71,7 @@ class NearestSurface {
     Vector<T, D> normal;
     T other;
     const Vector<T, D> body = to_body(pose, position_);
-    const T distance = surface(pose, body, normal, other);
+    const T distance = surface(pose, body, normal, &other);
     if (!(distance < nearest_)) {
       if (distance < second_) second_ = distance;
       return;

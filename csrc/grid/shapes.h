@@ -26,8 +26,14 @@ MPM_HD Vector<S, 2> offset_from_edge(const ValueOf<S>* a, const ValueOf<S>* b, c
   return arm + (along > S(0) ? S(0) - along : S(0)) * edge;
 }
 
+// Whether an edge is on the axis, inside the body.
+template <class T>
+MPM_HD bool is_on_axis(const T* a, const T* b) {
+  return a[0] == T(0) && b[0] == T(0);
+}
+
 // Height of a point (distance from the axis, position along it) above the line of edge k of a polygon; `beyond` is how
-// far the foot of the point is beyond the ends of the edge. Far above where the edge is on the axis, inside the body.
+// far the foot of the point is beyond the ends of the edge. Far above where the edge is on the axis.
 template <class S>
 MPM_HD S edge_height(const ValueOf<S>* corner, int corners, int k, const Vector<S, 2>& p, Vector<S, 2>& normal,
                      ValueOf<S>& beyond) {
@@ -38,60 +44,78 @@ MPM_HD S edge_height(const ValueOf<S>* corner, int corners, int k, const Vector<
   normal = direction(Vector<S, 2>{{edge[1], S(0) - edge[0]}});
   const T size = value_of(length(edge)), along = size > T(0) ? value_of(dot(arm, edge)) / size : T(0);
   beyond = along < T(0) ? T(0) - along : along > size ? along - size : T(0);
-  if (size == T(0) || (a[0] == T(0) && b[0] == T(0))) return S(std::numeric_limits<T>::max());
+  if (size == T(0) || is_on_axis(a, b)) return S(std::numeric_limits<T>::max());
   return dot(arm, normal);
 }
 
-// Signed distance of a point from a closed polygon, and the outward normal of its nearest edge; among equals, the first
-// counts. `second` is the distance of the edge that is nearest but for this one. Inside it is the depth and how far
-// another edge is from joining the nearest one (grid/solid.h): the way from the nearest point of the polygon to that
-// edge, or the height of the point above its line where it is not deeper below that. So the other side of a thin wall
-// is far.
+// The edge of a closed polygon that is nearest to a point; among equals, the first counts.
 template <class S>
-MPM_HD S polygon_surface(const ValueOf<S>* corner, int corners, const Vector<S, 2>& p, Vector<S, 2>& normal,
-                         ValueOf<S>& second) {
-  using T = ValueOf<S>;
-  S nearest = S(std::numeric_limits<T>::max());
-  second = std::numeric_limits<T>::max();
-  normal = zero_vector<S, 2>();
-  Vector<T, 2> foot = zero_vector<T, 2>();
-  int first = -1;
-  bool inside = false;
-  for (int k = 0; k < corners; k++) {
-    const T *const a = corner + 2 * k, *const b = end_of_edge(corner, corners, k);
-    const Vector<S, 2> edge = {{lift<S>(b[0] - a[0]), lift<S>(b[1] - a[1])}};
-    // An odd number of edges is crossed by the ray from the point away from the axis.
-    const S side = edge[0] * (p[1] - lift<S>(a[1])) - edge[1] * (p[0] - lift<S>(a[0]));
-    if ((a[1] > value_of(p[1])) != (b[1] > value_of(p[1])) && (edge[1] > S(0) ? side > S(0) : side < S(0)))
-      inside = !inside;
-    if (a[0] == T(0) && b[0] == T(0)) continue;  // an edge on the axis is inside the body
-    const Vector<S, 2> offset = offset_from_edge(a, b, p);
-    const S distance = length(offset);
-    if (distance < nearest) {
-      second = value_of(nearest);
-      nearest = distance;
-      normal = direction(Vector<S, 2>{{edge[1], S(0) - edge[0]}});
-      foot = {{value_of(p[0]) - value_of(offset[0]), value_of(p[1]) - value_of(offset[1])}};
-      first = k;
-    } else if (value_of(distance) < second) {
-      second = value_of(distance);
+struct NearestEdge {
+  int edge = -1;
+  bool inside = false;  // whether the point is in the polygon
+  Vector<S, 2> offset;  // of the point from the edge
+  S squared = S(std::numeric_limits<ValueOf<S>>::max());
+  ValueOf<S> second = std::numeric_limits<ValueOf<S>>::max();  // square of the distance of the next edge
+
+  MPM_HD NearestEdge(const ValueOf<S>* corner, int corners, const Vector<S, 2>& p) : offset(zero_vector<S, 2>()) {
+    for (int k = 0; k < corners; k++) {
+      const auto *const a = corner + 2 * k, *const b = end_of_edge(corner, corners, k);
+      const Vector<S, 2> along = {{lift<S>(b[0] - a[0]), lift<S>(b[1] - a[1])}};
+      // An odd number of edges is crossed by the ray from the point away from the axis.
+      const S side = along[0] * (p[1] - lift<S>(a[1])) - along[1] * (p[0] - lift<S>(a[0]));
+      if ((a[1] > value_of(p[1])) != (b[1] > value_of(p[1])) && (along[1] > S(0) ? side > S(0) : side < S(0)))
+        inside = !inside;
+      if (is_on_axis(a, b)) continue;
+      const Vector<S, 2> own = offset_from_edge(a, b, p);
+      const S distance = dot(own, own);
+      if (distance < squared) {
+        second = value_of(squared);
+        edge = k, offset = own, squared = distance;
+      } else if (value_of(distance) < second) {
+        second = value_of(distance);
+      }
     }
   }
-  if (!inside) return nearest;
-  const Vector<T, 2> point = {{value_of(p[0]), value_of(p[1])}};
-  const T depth = value_of(nearest);
+};
+
+// How far edges of a polygon are from joining edge `nearest` at a point inside (grid/solid.h): the way to them from the
+// nearest point of that, which is at an offset, or the height of the point above their line where it is not deeper.
+template <class T>
+MPM_HD T gap_of_edges(const T* corner, int corners, const Vector<T, 2>& p, int nearest, const Vector<T, 2>& offset) {
+  const Vector<T, 2> foot = p + T(-1) * offset;
+  const T lowest = T(-1.001) * length(offset);
   T gap = std::numeric_limits<T>::max();
   for (int k = 0; k < corners; k++) {
     const T *const a = corner + 2 * k, *const b = end_of_edge(corner, corners, k);
-    if (k == first || (a[0] == T(0) && b[0] == T(0))) continue;
+    if (k == nearest || is_on_axis(a, b)) continue;
     T way = length(offset_from_edge(a, b, foot)), beyond;
     Vector<T, 2> across;
-    const T height = edge_height(corner, corners, k, point, across, beyond);
-    if (height >= T(-1.001) * depth && height < way) way = height > T(0) ? height : T(0);
+    const T height = edge_height(corner, corners, k, p, across, beyond);
+    if (height >= lowest && height < way) way = height > T(0) ? height : T(0);
     if (way < gap) gap = way;
   }
-  second = depth + gap;
-  return S(0) - nearest;
+  return gap;
+}
+
+// Signed distance of a point from a closed polygon, and the outward normal of its nearest edge. `second`, unless null,
+// is that of the next edge; inside it is the depth and the gap of the edges, so that the other side of a thin wall is
+// far.
+template <class S>
+MPM_HD S polygon_surface(const ValueOf<S>* corner, int corners, const Vector<S, 2>& p, Vector<S, 2>& normal,
+                         ValueOf<S>* second) {
+  const NearestEdge<S> nearest(corner, corners, p);
+  const ValueOf<S> far = std::numeric_limits<ValueOf<S>>::max();
+  normal = zero_vector<S, 2>();
+  if (second) *second = far;
+  if (nearest.edge < 0) return S(far);
+  const auto *const a = corner + 2 * nearest.edge, *const b = end_of_edge(corner, corners, nearest.edge);
+  normal = direction(Vector<S, 2>{{lift<S>(b[1] - a[1]), lift<S>(a[0] - b[0])}});
+  const S distance = length(nearest.offset);
+  if (second && !nearest.inside && nearest.second < far) *second = std::sqrt(nearest.second);
+  const auto values = [](const Vector<S, 2>& v) { return Vector<ValueOf<S>, 2>{{value_of(v[0]), value_of(v[1])}}; };
+  if (second && nearest.inside)
+    *second = value_of(distance) + gap_of_edges(corner, corners, values(p), nearest.edge, values(nearest.offset));
+  return nearest.inside ? S(0) - distance : distance;
 }
 
 // Signed distance by multilinear interpolation of samples, and the direction of its gradient; beyond the samples the
@@ -192,7 +216,7 @@ struct PlaneShape : OneFace {
   static constexpr bool flat = true;
 
   template <class S, int D>
-  MPM_HD static S surface(const ObstaclePose<S, D>& o, const Vector<S, D>& body, Vector<S, D>& normal, ValueOf<S>&) {
+  MPM_HD static S surface(const ObstaclePose<S, D>& o, const Vector<S, D>& body, Vector<S, D>& normal, ValueOf<S>*) {
     const Vector<S, D> extent = extent_of(o);
     normal = (S(1) / length(extent)) * extent;
     return dot(body, normal);
@@ -209,14 +233,14 @@ MPM_HD S ball_surface(const Vector<S, D>& offset, const S& radius, Vector<S, D>&
 
 struct SphereShape : OneFace {
   template <class S, int D>
-  MPM_HD static S surface(const ObstaclePose<S, D>& o, const Vector<S, D>& body, Vector<S, D>& normal, ValueOf<S>&) {
+  MPM_HD static S surface(const ObstaclePose<S, D>& o, const Vector<S, D>& body, Vector<S, D>& normal, ValueOf<S>*) {
     return ball_surface(body, o.row->radius, normal);
   }
 };
 
 struct CapsuleShape : OneFace {
   template <class S, int D>
-  MPM_HD static S surface(const ObstaclePose<S, D>& o, const Vector<S, D>& body, Vector<S, D>& normal, ValueOf<S>&) {
+  MPM_HD static S surface(const ObstaclePose<S, D>& o, const Vector<S, D>& body, Vector<S, D>& normal, ValueOf<S>*) {
     const Vector<S, D> half = extent_of(o);
     const S squared = dot(half, half);
     S along = squared > S(0) ? dot(body, half) / squared : S(0);
@@ -228,7 +252,7 @@ struct CapsuleShape : OneFace {
 // All points within a radius of a circle, whose axis is as long as its radius; in 2-D two discs.
 struct TorusShape : OneFace {
   template <class S, int D>
-  MPM_HD static S surface(const ObstaclePose<S, D>& o, const Vector<S, D>& body, Vector<S, D>& normal, ValueOf<S>&) {
+  MPM_HD static S surface(const ObstaclePose<S, D>& o, const Vector<S, D>& body, Vector<S, D>& normal, ValueOf<S>*) {
     const Vector<S, D> ring = extent_of(o);
     const AroundAxis<S, D> around(ring, body);
     Vector<S, 2> plane_normal;
@@ -246,7 +270,7 @@ struct BoxShape {
 
   // The nearest face is that of the axis with the least negative distance.
   template <class S, int D>
-  MPM_HD static S surface(const ObstaclePose<S, D>& o, const Vector<S, D>& body, Vector<S, D>& normal, ValueOf<S>&) {
+  MPM_HD static S surface(const ObstaclePose<S, D>& o, const Vector<S, D>& body, Vector<S, D>& normal, ValueOf<S>*) {
     S deepest = S(0);
     int axis = -1;
     MPM_UNROLL for (int i = 0; i < D; i++) {
@@ -283,7 +307,7 @@ struct RevolvedShape {
 
   template <class S, int D>
   MPM_HD static S surface(const ObstaclePose<S, D>& o, const Vector<S, D>& body, Vector<S, D>& normal,
-                          ValueOf<S>& second) {
+                          ValueOf<S>* second) {
     const AroundAxis<S, D> around(extent_of(o), body);
     Vector<S, 2> plane_normal;
     const S distance = polygon_surface(o.data, o.numbers / 2, around.point, plane_normal, second);
@@ -310,8 +334,8 @@ struct RevolvedShape {
 struct SampledShape : OneFace {
   template <class S, int D>
   MPM_HD static S surface(const ObstaclePose<S, D>& o, const Vector<S, D>& body, Vector<S, D>& normal,
-                          ValueOf<S>& second) {
-    second = std::numeric_limits<ValueOf<S>>::lowest();
+                          ValueOf<S>* second) {
+    if (second) *second = std::numeric_limits<ValueOf<S>>::lowest();
     return sampled_surface(o.data, o.numbers, body, normal);
   }
 };
@@ -338,18 +362,14 @@ MPM_HD auto visit_shape(ObstacleShape shape, F&& f) {
 }
 
 // Signed distance of a point in body coordinates, and the unit normal out of the body: right inside, zero where the
-// shape has none. Outside, the distance is a lower bound. `second` is the distance of a second face of the shape, where
-// its faces may join at inner edges: the least number where they are not known one by one, and else the largest.
+// shape has none. Outside, the distance is a lower bound. `second`, unless null, is the distance of a second face of
+// the shape, where its faces may join at inner edges: the least number where they are not known one by one, and else
+// the largest.
 template <class S, int D>
-MPM_HD S surface(const ObstaclePose<S, D>& o, const Vector<S, D>& body, Vector<S, D>& normal, ValueOf<S>& second) {
-  second = std::numeric_limits<ValueOf<S>>::max();
+MPM_HD S surface(const ObstaclePose<S, D>& o, const Vector<S, D>& body, Vector<S, D>& normal,
+                 ValueOf<S>* second = nullptr) {
+  if (second) *second = std::numeric_limits<ValueOf<S>>::max();
   return visit_shape(o.shape, [&](auto shape) { return decltype(shape)::surface(o, body, normal, second); });
-}
-
-template <class S, int D>
-MPM_HD S surface(const ObstaclePose<S, D>& o, const Vector<S, D>& body, Vector<S, D>& normal) {
-  ValueOf<S> second;
-  return surface(o, body, normal, second);
 }
 
 // ---- the faces of a shape, which contact of several obstacles looks at one by one
