@@ -374,14 +374,14 @@ struct BlockTeam {
       return slopes + (int64_t((pair >> 8) * n + e / n) * m + (pair & 255) * n + e % n);
     };
     SumsByKey<n * n, T, decltype(slope_of)> of_slopes(slope_of);
-    constexpr int tile = 32, seeded = 32 / (D * D);  // nodes of a warp
+    constexpr int tile = 32, seeded = 32 / D;  // nodes of a warp
     for (int first = warp * tile; first < lone_count; first += adders * tile)
       add_lone_node(first + lane(), impulses, of_impulses, slopes, of_slopes);
     for (int first = warp * tile; impulses && first < count; first += adders * tile)
       add_impulses(first + lane(), of_impulses);
-    const int node = lane() / (D * D);  // the last lanes have none
+    const int node = lane() / D;  // the last lanes have none
     for (int first = warp * seeded; slopes && first < count; first += adders * seeded)
-      add_slopes(node < seeded ? first + node : count, lane() % (D * D), of_slopes);
+      add_slopes(node < seeded ? first + node : count, lane() % D, of_slopes);
     of_impulses.finish();
     of_slopes.finish();
   }
@@ -441,9 +441,9 @@ struct BlockTeam {
     }
   }
 
-  // Derivatives of the impulses on the faces of a node by the velocity of face `seed / D` along axis `seed % D`.
+  // Derivatives of the impulses on the faces of a node by the velocities of its faces along an axis.
   template <class Sums>
-  __device__ void add_slopes(int i, int seed, Sums& sums) const {
+  __device__ void add_slopes(int i, int axis, Sums& sums) const {
     const bool wanted = i < count;
     BodyNode<T, D> node;
     NodePush<T, D> push;
@@ -453,20 +453,19 @@ struct BlockTeam {
     load(wanted, i, node, mass, v);
     push.faces = 0;
     if (wanted) set_faces(a.contact, node, push);
-    const int by = seed / D, axis = seed % D;
-    const bool acts = by < push.faces;
-    if (any_of_warp(acts)) {
+    MPM_LOOP for (int by = 0; any_of_warp(by < push.faces); by++) {
+      const bool acts = by < push.faces;
       set_slopes(acts, node, mass, v, by, axis, slope);
       join_warp();
-    }
-    const int l = acts ? a.owner[push.obstacle[by]] : -1;
-    MPM_LOOP for (int face = 0; face < D; face++) {
-      const int k = acts && face < push.faces ? a.owner[push.obstacle[face]] : -1;
-      T block[n * n];
-      if (k >= 0)
-        set_slope_block(slope_by_axis(slope, face, axis), rounded_arm_from<T>(memory.now[k], push.at),
-                        rounded_arm_from<T>(memory.now[l], push.position), block);
-      sums.add(pair_of(k, l), block);
+      const int l = acts ? a.owner[push.obstacle[by]] : -1;
+      MPM_LOOP for (int face = 0; face < D; face++) {
+        const int k = acts && face < push.faces ? a.owner[push.obstacle[face]] : -1;
+        T block[n * n];
+        if (k >= 0)
+          set_slope_block(slope_by_axis(slope, face, axis), rounded_arm_from<T>(memory.now[k], push.at),
+                          rounded_arm_from<T>(memory.now[l], push.position), block);
+        sums.add(pair_of(k, l), block);
+      }
     }
   }
 
