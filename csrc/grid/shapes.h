@@ -32,6 +32,26 @@ MPM_HD bool is_on_axis(const T* a, const T* b) {
   return a[0] == T(0) && b[0] == T(0);
 }
 
+// Whether an edge leads to a tip, a point of the axis where it meets the same edge on the other side of the axis.
+template <class T>
+MPM_HD bool leads_to_tip(const T* a, const T* b) {
+  return (a[0] == T(0)) != (b[0] == T(0)) && a[1] != b[1];
+}
+
+// The edge number `tip` of those that lead to tips; as many as there are corners where there are fewer.
+template <class T>
+MPM_HD int edge_to_tip(const T* corner, int corners, int tip) {
+  int k = 0;
+  for (; k < corners; k++)
+    if (leads_to_tip(corner + 2 * k, end_of_edge(corner, corners, k)) && tip-- == 0) break;
+  return k;
+}
+
+template <class S>
+MPM_HD Vector<S, 2> across_axis(const Vector<S, 2>& p) {
+  return {{S(0) - p[0], p[1]}};
+}
+
 // Height of a point (distance from the axis, position along it) above the line of edge k of a polygon; `beyond` is how
 // far the foot of the point is beyond the ends of the edge. Far above where the edge is on the axis.
 template <class S>
@@ -78,28 +98,43 @@ struct NearestEdge {
   }
 };
 
-// How far edges of a polygon are from joining edge `nearest` at a point inside (grid/solid.h): the way to them from the
-// nearest point of that, which is at an offset, or the height of the point above their line where it is not deeper.
+// How far edges of a polygon, and those beyond a tip, are from joining edge `nearest` at a point inside (grid/solid.h):
+// the way to them from the nearest point of that, which is at an offset, or the height of the point above their line
+// where it is not deeper.
 template <class T>
 MPM_HD T gap_of_edges(const T* corner, int corners, const Vector<T, 2>& p, int nearest, const Vector<T, 2>& offset) {
   const Vector<T, 2> foot = p + T(-1) * offset;
   const T lowest = T(-1.001) * length(offset);
   T gap = std::numeric_limits<T>::max();
-  for (int k = 0; k < corners; k++) {
-    const T *const a = corner + 2 * k, *const b = end_of_edge(corner, corners, k);
-    if (k == nearest || is_on_axis(a, b)) continue;
-    T way = length(offset_from_edge(a, b, foot)), beyond;
-    Vector<T, 2> across;
-    const T height = edge_height(corner, corners, k, p, across, beyond);
+  const auto add = [&](int k, const Vector<T, 2>& point, const Vector<T, 2>& foot) {
+    T way = length(offset_from_edge(corner + 2 * k, end_of_edge(corner, corners, k), foot)), beyond;
+    Vector<T, 2> normal;
+    const T height = edge_height(corner, corners, k, point, normal, beyond);
     if (height >= lowest && height < way) way = height > T(0) ? height : T(0);
     if (way < gap) gap = way;
+  };
+  for (int k = 0; k < corners; k++) {
+    const T *const a = corner + 2 * k, *const b = end_of_edge(corner, corners, k);
+    if (k != nearest && !is_on_axis(a, b)) add(k, p, foot);
+    if (leads_to_tip(a, b)) add(k, across_axis(p), across_axis(foot));
   }
   return gap;
 }
 
+// Distance of the edges beyond tips from a point.
+template <class T>
+MPM_HD T distance_across_axis(const T* corner, int corners, const Vector<T, 2>& p) {
+  T distance = std::numeric_limits<T>::max();
+  for (int k = 0; k < corners; k++) {
+    const T *const a = corner + 2 * k, *const b = end_of_edge(corner, corners, k);
+    if (leads_to_tip(a, b)) distance = std::fmin(distance, length(offset_from_edge(a, b, across_axis(p))));
+  }
+  return distance;
+}
+
 // Signed distance of a point from a closed polygon, and the outward normal of its nearest edge. `second`, unless null,
-// is that of the next edge; inside it is the depth and the gap of the edges, so that the other side of a thin wall is
-// far.
+// is that of the next edge, or of one beyond a tip; inside it is the depth and the gap of the edges, so that the other
+// side of a thin wall is far.
 template <class S>
 MPM_HD S polygon_surface(const ValueOf<S>* corner, int corners, const Vector<S, 2>& p, Vector<S, 2>& normal,
                          ValueOf<S>* second) {
@@ -111,10 +146,11 @@ MPM_HD S polygon_surface(const ValueOf<S>* corner, int corners, const Vector<S, 
   const auto *const a = corner + 2 * nearest.edge, *const b = end_of_edge(corner, corners, nearest.edge);
   normal = direction(Vector<S, 2>{{lift<S>(b[1] - a[1]), lift<S>(a[0] - b[0])}});
   const S distance = length(nearest.offset);
-  if (second && !nearest.inside && nearest.second < far) *second = std::sqrt(nearest.second);
   const auto values = [](const Vector<S, 2>& v) { return Vector<ValueOf<S>, 2>{{value_of(v[0]), value_of(v[1])}}; };
   if (second && nearest.inside)
     *second = value_of(distance) + gap_of_edges(corner, corners, values(p), nearest.edge, values(nearest.offset));
+  else if (second)
+    *second = std::fmin(std::sqrt(nearest.second), distance_across_axis(corner, corners, values(p)));
   return nearest.inside ? S(0) - distance : distance;
 }
 
@@ -178,6 +214,21 @@ MPM_HD Vector<S, D> extent_of(const ObstaclePose<S, D>& o) {
   return extent;
 }
 
+// A unit vector that is perpendicular to one.
+template <class S, int D>
+MPM_HD Vector<S, D> perpendicular(const Vector<S, D>& axis) {
+  int least = 0;
+  MPM_UNROLL for (int i = 1; i < D; i++)
+    if (abs(axis[i]) < abs(axis[least])) least = i;
+  S along = S(0);
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    along = i == least ? axis[i] : along;
+  Vector<S, D> unit;
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    unit[i] = S(i == least ? 1 : 0) - along * axis[i];
+  return direction(unit);
+}
+
 // A point by its distance from an axis through the origin, and its position along that.
 template <class S, int D>
 struct AroundAxis {
@@ -191,17 +242,21 @@ struct AroundAxis {
     point = {{length(across), along}};
     across = direction(across);
   }
-  MPM_HD Vector<S, D> in_space(const Vector<S, 2>& v) const { return v[0] * across + v[1] * axis; }
+  // A unit vector; of a point on the axis, that along it or zero.
+  MPM_HD Vector<S, D> in_space(const Vector<S, 2>& v) const {
+    const Vector<S, D> r = v[0] * across + v[1] * axis;
+    return point[0] > S(0) ? r : direction(r);
+  }
 };
 
 // What most shapes have: one curved face, the surface, whose number is −1.
 struct OneFace {
-  // Whether the height above a face is linear in the position.
-  template <int D>
-  static constexpr bool flat = false;
-
-  template <int D>
-  MPM_HD static int face_count(int) {
+  template <class T, int D>
+  MPM_HD static bool is_flat(const ObstaclePose<T, D>&, int, const Vector<T, D>&, const T&) {
+    return false;
+  }
+  template <int D, class T>
+  MPM_HD static int face_count(const T*, int) {
     return 1;
   }
   template <class S, int D>
@@ -212,8 +267,10 @@ struct OneFace {
 };
 
 struct PlaneShape : OneFace {
-  template <int D>
-  static constexpr bool flat = true;
+  template <class T, int D>
+  MPM_HD static bool is_flat(const ObstaclePose<T, D>&, int, const Vector<T, D>&, const T&) {
+    return true;
+  }
 
   template <class S, int D>
   MPM_HD static S surface(const ObstaclePose<S, D>& o, const Vector<S, D>& body, Vector<S, D>& normal, ValueOf<S>*) {
@@ -265,8 +322,10 @@ struct TorusShape : OneFace {
 
 // Faces 2 i and 2 i + 1 are the lower and the upper one of axis i.
 struct BoxShape {
-  template <int D>
-  static constexpr bool flat = true;
+  template <class T, int D>
+  MPM_HD static bool is_flat(const ObstaclePose<T, D>&, int, const Vector<T, D>&, const T&) {
+    return true;
+  }
 
   // The nearest face is that of the axis with the least negative distance.
   template <class S, int D>
@@ -281,8 +340,8 @@ struct BoxShape {
       normal[i] = i != axis ? S(0) : body[i] < S(0) ? S(-1) : S(1);
     return deepest;
   }
-  template <int D>
-  MPM_HD static int face_count(int) {
+  template <int D, class T>
+  MPM_HD static int face_count(const T*, int) {
     return 2 * D;
   }
   template <class S, int D>
@@ -299,11 +358,21 @@ struct BoxShape {
   }
 };
 
-// One face for each edge of its polygon. Their numbers are the corners, anticlockwise: distance from the axis and
-// position along it.
+// One face for each edge of its polygon, and one more for each edge that leads to a tip: that beyond the axis. Its
+// numbers are the corners, anticlockwise: distance from the axis and position along it.
 struct RevolvedShape {
-  template <int D>
-  static constexpr bool flat = D == 2;
+  template <class T>
+  MPM_HD static int edge_of(const T* corner, int corners, int face) {
+    return face < corners ? face : edge_to_tip(corner, corners, face - corners);
+  }
+
+  // Near a tip, planes in the meridian of the point are the faces that join there.
+  template <class T, int D>
+  MPM_HD static bool is_flat(const ObstaclePose<T, D>& o, int face, const Vector<T, D>& body, const T& reach) {
+    const int edge = edge_of(o.data, o.numbers / 2, face);
+    return D == 2 || (leads_to_tip(o.data + 2 * edge, end_of_edge(o.data, o.numbers / 2, edge)) &&
+                      AroundAxis<T, D>(extent_of(o), body).point[0] <= reach);
+  }
 
   template <class S, int D>
   MPM_HD static S surface(const ObstaclePose<S, D>& o, const Vector<S, D>& body, Vector<S, D>& normal,
@@ -314,17 +383,29 @@ struct RevolvedShape {
     normal = around.in_space(plane_normal);
     return distance;
   }
-  template <int D>
-  MPM_HD static int face_count(int numbers) {
-    return numbers / 2;
+  template <int D, class T>
+  MPM_HD static int face_count(const T* corner, int numbers) {
+    const int corners = numbers / 2;
+    int tips = 0;
+    while (edge_to_tip(corner, corners, tips) < corners) tips++;
+    return corners + tips;
   }
   template <class S, int D>
   MPM_HD static S face_height(const ObstaclePose<S, D>& o, int face, const Vector<S, D>& body, Vector<S, D>& normal,
                               ValueOf<S>& beyond) {
-    const AroundAxis<S, D> around(extent_of(o), body);
+    AroundAxis<S, D> around(extent_of(o), body);
+    const int corners = o.numbers / 2;
+    const bool across = face >= corners;
+    const int edge = edge_of(o.data, corners, face);
+    const bool any_meridian =
+        !(around.point[0] > S(0)) && leads_to_tip(o.data + 2 * edge, end_of_edge(o.data, corners, edge));
+    if (any_meridian) around.across = perpendicular(around.axis);
     Vector<S, 2> plane_normal;
-    const S height = edge_height(o.data, o.numbers / 2, face, around.point, plane_normal, beyond);
-    normal = around.in_space(plane_normal);
+    const S height =
+        edge_height(o.data, corners, edge, across ? across_axis(around.point) : around.point, plane_normal, beyond);
+    if (across) plane_normal = across_axis(plane_normal);
+    normal =
+        any_meridian ? plane_normal[0] * around.across + plane_normal[1] * around.axis : around.in_space(plane_normal);
     return height;
   }
 };
@@ -374,15 +455,16 @@ MPM_HD S surface(const ObstaclePose<S, D>& o, const Vector<S, D>& body, Vector<S
 
 // ---- the faces of a shape, which contact of several obstacles looks at one by one
 
-template <int D>
-MPM_HD int face_count(const ObstacleKind& o) {
-  return visit_shape(o.shape, [&](auto shape) { return decltype(shape)::template face_count<D>(o.numbers); });
+// `data` are the numbers of the shape.
+template <int D, class T>
+MPM_HD int face_count(const ObstacleKind& o, const T* data) {
+  return visit_shape(o.shape, [&](auto shape) { return decltype(shape)::template face_count<D>(data, o.numbers); });
 }
 
-// Whether the height above a face is linear in the position.
-template <int D>
-MPM_HD bool is_flat(ObstacleShape shape) {
-  return visit_shape(shape, [](auto shape) { return decltype(shape)::template flat<D>; });
+// Whether the height above a face is linear in the position, within a reach around a point in body coordinates.
+template <class T, int D>
+MPM_HD bool is_flat(const ObstaclePose<T, D>& o, int face, const Vector<T, D>& body, const T& reach) {
+  return visit_shape(o.shape, [&](auto shape) { return decltype(shape)::is_flat(o, face, body, reach); });
 }
 
 // Height of a point in body coordinates above the surface that carries a face, and the unit normal of that; `beyond` is

@@ -11,7 +11,7 @@
 // boxes does not act. Candidates for the foot are the feet on each face, and the points where two or three faces meet,
 // that are exposed: a step from there into free space leaves all obstacles. Of these that of the least depth counts,
 // where the depth below several faces is the largest of those below each; so walls of tanks may be as thin at a corner
-// as elsewhere.
+// as elsewhere. The tip of a hollow cone on its axis is a corner of two faces, both in the meridian of the node.
 //
 // Nodes at a wall of the domain or beyond see the obstacles as the nearest point of the wall does, those behind a
 // mirror as their images do.
@@ -253,6 +253,19 @@ struct Face {
   T rounded = T(0);       // depth
 };
 
+// Sets what a point sees of a face, whose numbers and point `at` are given.
+template <class Poses, class T, int D>
+MPM_HD_CALL void compute_face(bool wanted, const Poses& poses, const T& reach, Face<T, D>& face, T& beyond) {
+  if (!wanted) return;
+  const auto& pose = poses[face.obstacle];
+  const Vector<T, D> body = to_body(pose, face.at);
+  Vector<T, D> normal;
+  face.height = face_height(pose, face.face, body, normal, beyond);
+  face.normal = pose.rotation * normal;
+  face.depth = T(0) - face.height;
+  face.flat = is_flat(pose, face.face, body, reach);
+}
+
 template <class T, int D>
 struct Faces {
   int count = 0;
@@ -376,7 +389,7 @@ class SolidAt {
   MPM_HD void add_faces(bool wanted, int k) {
     const bool sampled = wanted && shape_of(k) == ObstacleShape::sampled;
     if (any_of_warp(sampled)) add_by_distance(sampled, k);
-    int count = wanted && !sampled ? face_count<D>(a_.kind[k]) : 0;
+    int count = wanted && !sampled ? face_count<D>(a_.kind[k], a_.data + a_.kind[k].first_number) : 0;
     const bool is_box = wanted && shape_of(k) == ObstacleShape::box;  // whose faces are all far where it is
     V unused;
     if (!(height_of(is_box, k, node_, unused) <= reach_)) count = 0;
@@ -385,10 +398,12 @@ class SolidAt {
   }
 
   MPM_HD void add_face(bool wanted, int k, int f) {
-    Face<T, D> face{k, f, wanted && is_flat<D>(shape_of(k)), node_, {}, T(0), T(0)};
+    Face<T, D> face{k, f, false, node_, {}, T(0), T(0)};
     T beyond = T(0);
-    face.height = height_above(wanted, poses_, k, f, node_, face.normal, beyond);
-    face.depth = T(0) - face.height;
+    if (any_of_warp(wanted)) {
+      compute_face(wanted, poses_, reach_, face, beyond);
+      join_warp();
+    }
     if (!wanted || !(face.height <= seam_ / 2) || !(face.depth <= reach_) || beyond > reach_) return;
     if (dot(face.normal, face.normal) > T(0.5)) add(face);
   }

@@ -555,14 +555,16 @@ def test_the_kernel_is_what_torch_operations_are(device, dim, dtype, walls):
 
 
 def any_outline(random: torch.Generator) -> list[tuple[float, float]]:
-    """A star around a point, beside the axis or on it with flat ends."""
+    """A star around a point, beside the axis or with tips on it."""
     count = int(torch.randint(5, 12, (), generator=random))
     radii = (0.15 + 0.6 * torch.rand(count, generator=random, dtype=torch.float64)).tolist()
     if count % 2:
-        return [(0.8 + r * math.cos(t), r * math.sin(t)) for i, r in enumerate(radii) for t in [2 * math.pi * i / count]]
+        return [
+            (0.8 + r * math.cos(t), r * math.sin(t)) for i, r in enumerate(radii) for t in [2 * math.pi * i / count]
+        ]
     turns = [math.pi * (i / (count - 1) - 0.5) for i in range(count)]
     corners = [(r * math.cos(t), r * math.sin(t)) for r, t in zip(radii, turns, strict=True)]
-    return [(0.0, corners[1][1]), *corners[1:-1], (0.0, corners[-2][1])]
+    return [(0.0, corners[0][1]), *corners[1:-1], (0.0, corners[-1][1])]
 
 
 def test_nodes_in_an_outline_meet_all_its_faces_that_join(device, dim):
@@ -578,6 +580,32 @@ def test_nodes_in_an_outline_meet_all_its_faces_that_join(device, dim):
         after, expected = contact(blocks, velocity, [obstacle], 0.0), in_torch(blocks, velocity, [obstacle])
         active = blocks.active_nodes()
         torch.testing.assert_close(after[active], expected[active], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("axis", [(0.0, 1.0, 0.0), (0.6, 0.8, 0.0)])
+@pytest.mark.parametrize("at", [0.0, 0.013])
+def test_nodes_behind_the_tip_of_a_cone_meet_both_sides_of_it(device, dim, axis, at):
+    """Of a solid with a hollow cone in it, as two planes have it; nodes may be on the axis."""
+    grid = mpm.Grid(0.1, (-2.0,) * dim, (2.0,) * dim)
+    blocks = grid.activate(torch.rand(4000, dim, dtype=torch.float64, device=device) - 0.5)
+    turn = math.atan2(axis[0], axis[1])  # of y to the axis
+    cone = Obstacle(shapes.Revolved([(0, -2), (2, -2), (2, 1.6), (0, 0)], axis[:dim]), [at, *[0.0] * (dim - 1)], "slip")
+    sides = []
+    for angle in (math.atan2(2, 1.6), math.pi - math.atan2(2, 1.6)):
+        normal = [math.cos(angle - turn), math.sin(angle - turn), 0.0]
+        sides.append(mpm.Plane([at, *[0.0] * (dim - 1)], normal[:dim], kind="slip"))
+    x = blocks.node_positions(torch.float64)
+    velocity = torch.zeros_like(x)
+    velocity[:, 1] = -1.0
+    arm = x - x.new_tensor([at, *[0.0] * (dim - 1)])
+    below = arm @ arm.new_tensor(axis[:dim]) < -0.06
+    middle = blocks.active_nodes() & below & (arm.norm(dim=1) < 0.29)  # within reach of the tip
+    if dim == 3:  # in the plane of the axis and y
+        middle &= x[:, 2].abs() < 1e-9
+    after = contact(blocks, velocity, [cone], 0.0)[middle]
+    expected = contact(blocks, velocity, sides, 0.0)[middle]
+    torch.testing.assert_close(after, expected, rtol=0, atol=1e-9)
+    assert int((after.abs().amax(1) < 1e-9).sum()) >= 3  # the tip stops nodes
 
 
 @pytest.mark.parametrize("kind", ["separate", "slip", "sticky"])

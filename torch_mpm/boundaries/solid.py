@@ -343,7 +343,7 @@ class _Candidates:
 
     Attributes:
         owner, face: of each column, int64 [F].
-        flat: whether its heights are linear, bool [F].
+        flat: whether heights are linear, bool [N, F].
         at, height, normal: a point [N, F, D], its height [N, F] and the normal there [N, F, D].
         depth: of the nodes [N, F] [m]; infinite for faces that a node does not look at.
     """
@@ -366,7 +366,7 @@ class _Candidates:
 
     def nearest(self, most: int, solid: SolidNodes, x: Tensor) -> _Candidates:
         """The nearest `most` of each node, in an order that does not depend on that of obstacles and outlines: by the
-        depth in steps of `solid.unit`, the kind, the friction and the normal. Columns of the first three are then those
+        depth in steps of `solid.unit`, the kind, the friction and the normal. Columns of the first two are then those
         of each node [N, M]."""
         order = torch.arange(self.depth.shape[1], device=x.device).expand_as(self.depth)
         kind = solid.kinds()[self.owner].expand_as(self.depth)
@@ -383,7 +383,7 @@ class _Candidates:
         return _Candidates(
             self.owner[order],
             self.face[order],
-            self.flat[order],
+            self.flat.gather(1, order),
             self.at.gather(1, wide),
             self.height.gather(1, order),
             self.normal.gather(1, wide),
@@ -394,11 +394,11 @@ class _Candidates:
 def _faces_near(solid: SolidNodes, x: Tensor, distance: Tensor) -> _Candidates:
     parts: list[list[Tensor]] = [[] for _ in range(7)]
 
-    def add(k: int, face: int, flat: bool, at: Tensor, height: Tensor, normal: Tensor, depth: Tensor) -> None:
+    def add(k: int, face: int, flat: bool | Tensor, at: Tensor, height: Tensor, normal: Tensor, depth: Tensor) -> None:
         values = (
             solid.constants([k])[0],
             solid.constants([face])[0],
-            solid.constants([flat])[0],
+            solid.constants([flat])[0].expand(len(x)) if isinstance(flat, bool) else flat,
             at,
             height,
             normal,
@@ -419,9 +419,10 @@ def _faces_near(solid: SolidNodes, x: Tensor, distance: Tensor) -> _Candidates:
             height, normal = found.height[:, f], found.normal[:, f]
             sees = near & (height <= solid.seam / 2) & (-height <= solid.reach) & (found.beyond[:, f] <= solid.reach)
             sees = sees & ((normal * normal).sum(1) > 0.5)
-            add(k, -1 if alone else f, found.flat, x, height, normal, torch.where(sees, -height, torch.inf))
-    owner, face, flat = (torch.stack(part) for part in parts[:3])
-    at, height, normal, depth = (torch.stack(part, 1) for part in parts[3:])
+            flat = found.flat if isinstance(found.flat, bool) else found.flat[:, f] <= solid.reach
+            add(k, -1 if alone else f, flat, x, height, normal, torch.where(sees, -height, torch.inf))
+    owner, face = (torch.stack(part) for part in parts[:2])
+    flat, at, height, normal, depth = (torch.stack(part, 1) for part in parts[2:])
     return _Candidates(owner, face, flat, at, height.nan_to_num(posinf=0.0), normal, depth)
 
 

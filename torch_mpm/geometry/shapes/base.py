@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ..per_scene import SceneParameters
 from ..surface_mesh import Array, SurfaceMesh
+from ..vectors import unit
 
 
 class Faces(NamedTuple):
@@ -20,13 +21,13 @@ class Faces(NamedTuple):
         height: of the points above the surface that carries each face [N, F] [m], negative inside.
         normal: unit normals of these, out of the shape [N, F, D].
         beyond: about how far the foot of each point is from the face itself [N, F] [m].
-        flat: whether heights are linear in the position.
+        flat: whether heights are linear in the position; or how far each point is from where they are so [N, F] [m].
     """
 
     height: Tensor
     normal: Tensor
     beyond: Tensor
-    flat: bool
+    flat: bool | Tensor
 
 
 class SceneKey(NamedTuple):
@@ -162,6 +163,19 @@ def split_along(x: Tensor, axis: Tensor) -> tuple[Tensor, Tensor]:
     """Positions along a unit vector [D] or [N, D], [N, 1], and the rest of x [N, D]."""
     along = (x * axis).sum(1, keepdim=True)
     return along, x - along * axis
+
+
+def in_meridian(normal: Tensor, across: Tensor, axis: Tensor) -> Tensor:
+    """Unit vectors [N, D] by their components [N, 2] along `across` [N, D] and a unit vector, the axis [D] or [N, D].
+    Those of points on the axis, where `across` is zero, are along it or zero."""
+    result = normal[:, :1] * unit(across) + normal[:, 1:] * axis
+    return torch.where((across != 0).any(1, keepdim=True), result, unit(result))
+
+
+def perpendicular(axis: Tensor) -> Tensor:
+    """Unit vectors [..., D] that are perpendicular to given ones."""
+    least = torch.nn.functional.one_hot(axis.abs().argmin(-1), axis.shape[-1]).to(axis.dtype)
+    return unit(least - (least * axis).sum(-1, keepdim=True) * axis)
 
 
 def ball_volume(dim: int, radius: float) -> float:

@@ -15,7 +15,7 @@ from .. import surface_mesh
 from ..surface_mesh import Array, SurfaceMesh
 from ..values import Value, direction, finite, numbers_of, shape_of_value
 from ..vectors import norm, unit
-from .base import Faces, SceneKey, SceneWords, Shape, split_along
+from .base import Faces, SceneKey, SceneWords, Shape, in_meridian, perpendicular, split_along
 
 
 def _checked_outline(name: str, outline: Any) -> Any:
@@ -78,21 +78,44 @@ class Revolved(Shape):
         """The normal is that of the nearest edge of the polygon, also where a reentrant corner is nearest."""
         axis, along, across = self._split(x, scene)
         distance, normal = self._polygon(torch.cat([norm(across)[:, None], along], 1))
-        return distance, normal[:, :1] * unit(across) + normal[:, 1:] * axis
+        return distance, in_meridian(normal, across, axis)
 
     def surface_faces(self, x: Tensor, scene: Tensor | None = None) -> Faces:
-        """One of each edge of the polygon; those on the axis, which are inside the body, are infinitely high."""
+        """One of each edge of the polygon; those on the axis, which are inside the body, are infinitely high. An edge
+        that leads to a tip, a point of the axis, has one beyond the axis, too: they join there. Near a tip both are
+        planes in the meridian of a point."""
         axis, along, across = self._split(x, scene)
         a = self.parameter("outline", x, (len(self.outline), 2))
         edge = a.roll(-1, 0) - a
         size = norm(edge)
-        arm = torch.cat([norm(across)[:, None], along], 1)[:, None] - a
         plane = unit(torch.stack([edge[:, 1], -edge[:, 0]], 1))
-        on_axis = ((a[:, 0] == 0) & (edge[:, 0] == 0)) | (size == 0)
-        height = torch.where(on_axis, torch.inf, (arm * plane).sum(2))
-        foot = (arm * edge).sum(2) / torch.where(size > 0, size, 1)
-        normal = plane[:, :1] * unit(across)[:, None] + plane[:, 1:] * axis.expand_as(x)[:, None]
-        return Faces(height, normal, torch.maximum(-foot, foot - size).clamp_min(0), x.shape[1] == 2)
+        hidden = ((a[:, 0] == 0) & (edge[:, 0] == 0)) | (size == 0)
+        to_tip = ((a[:, 0] == 0) != (a.roll(-1, 0)[:, 0] == 0)) & (edge[:, 1] != 0)
+        radius, along_axis = norm(across)[:, None], axis.expand_as(x)[:, None]
+        on_axis = (radius == 0)[..., None]
+        away = torch.where(on_axis & to_tip[:, None], perpendicular(along_axis), unit(across)[:, None])
+        found = []
+        for side, missing in ((1, hidden), (-1, ~to_tip))[: 2 if self._has_tips() else 1]:
+            arm = torch.cat([side * radius, along], 1)[:, None] - a
+            foot = (arm * edge).sum(2) / torch.where(size > 0, size, 1)
+            normal = side * plane[:, :1] * away + plane[:, 1:] * along_axis
+            found.append(
+                (
+                    torch.where(missing, torch.inf, (arm * plane).sum(2)),
+                    torch.where(on_axis, unit(normal), normal),
+                    torch.maximum(-foot, foot - size).clamp_min(0),
+                    torch.where(to_tip, radius, torch.inf),
+                )
+            )
+        height, normal, beyond, flat = (torch.cat(parts, 1) for parts in zip(*found, strict=True))
+        return Faces(height, normal, beyond, True if x.shape[1] == 2 else flat)
+
+    def _has_tips(self) -> bool:
+        """Whether edges lead to tips; always where the outline is a tensor, whose values are not read."""
+        if isinstance(self.outline, Tensor):
+            return True
+        ends = zip(self.outline, [*self.outline[1:], self.outline[0]], strict=True)
+        return any((a[0] == 0) != (b[0] == 0) and a[1] != b[1] for a, b in ends)
 
     def _split(self, x: Tensor, scene: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
         """The axis [D] or [N, D], positions along it [N, 1], and the rest of x [N, D]."""

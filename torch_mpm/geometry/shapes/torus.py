@@ -14,7 +14,7 @@ from .. import surface_mesh
 from ..surface_mesh import Array, SurfaceMesh
 from ..values import Value, direction, extent
 from ..vectors import norm, unit
-from .base import Faces, SceneKey, SceneWords, Shape, around_origin, ball_volume, one_face, split_along
+from .base import Faces, SceneKey, SceneWords, Shape, around_origin, ball_volume, in_meridian, one_face, split_along
 
 
 class Torus(Shape):
@@ -57,7 +57,7 @@ class Torus(Shape):
         offset = torch.cat([norm(across)[:, None] - norm(ring).unsqueeze(-1), along], 1)
         normal = unit(offset)
         distance = norm(offset) - self.at_nodes("radius", x, (), scene)
-        return distance, normal[:, :1] * unit(across) + normal[:, 1:] * axis
+        return distance, in_meridian(normal, across, axis)
 
     def surface_faces(self, x: Tensor, scene: Tensor | None = None) -> Faces:
         return one_face(*self.surface(x, scene), False)
