@@ -5,9 +5,9 @@ energy and that of the force may only become less. The growth is the largest ene
 beginning, and the penetration the largest depth of a particle inside the disc, in cells; both are taken at twelve
 times of the run. "solved": `FreeBodies`, whose velocities are solved for with the contact of the nodes. "one exchange":
 a disc that takes the impulses of each step after it, as in `RigidBodies.advance`. "penalty": springs and dashpots
-between the disc and the particles inside it (benchmarks/stability/penalty.py), whose energy is not counted. The time
-step is a share of the largest stable one of the material alone. Blocks under discs that are heavier than themselves
-are stiffer by the ratio of the masses, and so are the springs.
+between the disc and the particles inside it (benchmarks/stability/penalty.py), whose energy is not counted. "stiff
+penalty": springs that are ten times stiffer. The time step is a share of the largest stable one of the material alone.
+Blocks under discs that are heavier than themselves are stiffer by the ratio of the masses, and so are the springs.
 """
 
 from __future__ import annotations
@@ -108,15 +108,16 @@ def one_exchange(step: mpm.Step, disc: penalty.Disc) -> tuple[Advance, None]:
     return advance, None
 
 
-def by_penalty(step: mpm.Step, disc: penalty.Disc) -> tuple[Advance, None]:
+def by_penalty(share: float, step: mpm.Step, disc: penalty.Disc) -> tuple[Advance, None]:
     modulus = YOUNG * stiffness(disc.mass) * (1.0 - NU) / ((1.0 + NU) * (1.0 - 2.0 * NU))  # P-wave modulus
-    return partial(penalty.advance, step, disc, modulus, wrench(disc)), None
+    return partial(penalty.advance, step, disc, share * modulus, wrench(disc)), None
 
 
 COUPLINGS: Mapping[str, Callable[[mpm.Step, penalty.Disc], tuple[Advance, FreeBodies | None]]] = {
     "solved": solved,
     "one exchange": one_exchange,
-    "penalty": by_penalty,
+    "penalty": partial(by_penalty, penalty.SHARE),
+    "stiff penalty": partial(by_penalty, 10.0 * penalty.SHARE),
 }
 
 

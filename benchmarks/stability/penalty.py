@@ -2,10 +2,10 @@
 
 Explicit, as in codes of finite elements. Each particle inside the disc is a node in contact:
 
-- a spring pushes it out along the normal, with the stiffness 0.1 K A²/V (Hallquist, Goudreau and Benson 1985, CMAME
-  51; the default of LS-DYNA, Theory Manual 2006, "Standard Penalty Formulation"). K is the P-wave modulus of the
-  material, V the volume of the particle, and A its area on the surface: in 3-D this is the share 0.1 of K times the
-  spacing of the particles;
+- a spring pushes it out along the normal, with the stiffness s K A²/V (Hallquist, Goudreau and Benson 1985, CMAME 51).
+  The share s is 0.1 by default in LS-DYNA (Theory Manual 2006, "Standard Penalty Formulation"). K is the P-wave modulus
+  of the material, V the volume of the particle, and A its area on the surface: in 3-D, K A²/V is K times the spacing
+  of the particles;
 - a dashpot has a fifth of the critical damping, of the smaller mass and of the frequency of the two masses (the
   same, "Viscous Contact Damping");
 - friction is Coulomb's, regularised: proportional to the sliding velocity below `STICK` (Wriggers, Computational
@@ -23,7 +23,8 @@ from torch import Tensor
 import torch_mpm as mpm
 from torch_mpm.bodies import moved
 
-STIFFNESS, DAMPING = 0.1, 0.2
+SHARE, DAMPING = 0.1, 0.2
+"""Share of the stiffness of the material, and of the critical damping."""
 STICK = 0.01
 """Sliding velocity from which friction has its full value [m/s]."""
 
@@ -42,11 +43,13 @@ def penetration(disc: Disc, x: Tensor, centre: Tensor) -> Tensor:
     return disc.radius - (x - centre).norm(dim=1)
 
 
-def forces(disc: Disc, state: mpm.State, row: Tensor, modulus: float, dt: float) -> Tensor:
-    """Forces on the particles [P, 2] [N/m] for a pose and velocity [6] of the disc and the P-wave modulus [Pa]."""
+def forces(disc: Disc, state: mpm.State, row: Tensor, stiffness: float, dt: float) -> Tensor:
+    """Forces on the particles [P, 2] [N/m] for a pose and velocity [6] of the disc and the stiffness of the springs.
+
+    The stiffness is s K [Pa]: A²/V of a particle of the volume h² · 1 m, with the area h · 1 m on the surface, is 1 m.
+    """
     depth, arm = penetration(disc, state.x, row[:2]), state.x - row[:2]
     normal = arm / arm.norm(dim=1, keepdim=True)
-    stiffness = STIFFNESS * modulus  # A² / V is 1 m: of a particle of V = h² · 1 m, the area on the surface is h · 1 m
     frequency = (stiffness * (1.0 / state.mass + 1.0 / disc.mass)).sqrt()
     mass = state.mass.clamp_max(disc.mass)
     dashpot = DAMPING * 2.0 * mass * frequency
@@ -60,12 +63,12 @@ def forces(disc: Disc, state: mpm.State, row: Tensor, modulus: float, dt: float)
 
 
 def advance(
-    step: mpm.Step, disc: Disc, modulus: float, wrench: Tensor, state: mpm.State, rows: Tensor, n: int, dt: float
+    step: mpm.Step, disc: Disc, stiffness: float, wrench: Tensor, state: mpm.State, rows: Tensor, n: int, dt: float
 ) -> tuple[mpm.State, Tensor]:
-    """n steps of the particles and of a disc [1, 1, 6] on which a wrench [3] acts too."""
+    """n steps of the particles and of a disc [1, 1, 6], with springs of a stiffness [Pa] and a further wrench [3]."""
     inertia = wrench.new_tensor([disc.mass, disc.mass, disc.inertia])
     for _ in range(n):
-        on_particles = forces(disc, state, rows[0, 0], modulus, dt)
+        on_particles = forces(disc, state, rows[0, 0], stiffness, dt)
         arm = state.x - rows[0, 0, :2]
         torque = arm[:, 0] * on_particles[:, 1] - arm[:, 1] * on_particles[:, 0]
         of_contact = torch.cat([on_particles, torque[:, None]], 1).sum(0)
