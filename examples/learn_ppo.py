@@ -187,10 +187,10 @@ def train(name: str, training: Training, seed: int = 0, device: str = "cpu") -> 
     return Result(policy, model.num_timesteps, curve.points, curve.failed, before, after)
 
 
-def beside_the_plan(name: str, policy: nn.Module, device: str) -> tuple[float, float]:
-    """Returns of the network and of the best plan by gradients, in the scene of this plan."""
+def beside_the_plan(name: str, policy: nn.Module, device: str) -> tuple[float, float, float]:
+    """Returns of the network, and of the first and the best plan by gradients, in the scene of this plan."""
     _, rewards = improve(GUESSES[name], device)
-    return float(episode(make_env(name, 1, device), policy, 0).returns), max(rewards)
+    return float(episode(make_env(name, 1, device), policy, 0).returns), rewards[0], max(rewards)
 
 
 def plot(axes: Any, result: Result) -> None:
@@ -218,8 +218,8 @@ def main(name: str, out: Path, training: Training, seed: int = 0, device: str = 
     draw(name, result, out / f"{name}.png")
     before, after = (test.returns.mean() for test in (result.before, result.after))
     print(f"{name}: return {before:.4f} of the untrained network in the test, {after:.4f} of the trained one")
-    trained, planned = beside_the_plan(name, result.policy, device)
-    print(f"in scene 0: return {trained:.4f} of the network, {planned:.4f} of the plan by gradients")
+    trained, first, best = beside_the_plan(name, result.policy, device)
+    print(f"in scene 0: return {trained:.4f} of the network, {first:.4f} of the first plan, {best:.4f} by gradients")
     return result
 
 
