@@ -1,16 +1,19 @@
 """PPO on the tasks of `torch_mpm.envs`: returns before and after, and times.
 
-    python -m benchmarks.envs_ppo             # a quarter of an hour on 2 cores
-    python -m benchmarks.envs_ppo --quick     # seconds
+    python -m benchmarks.envs_ppo --processes 2     # a quarter of an hour on 2 cores
+    python -m benchmarks.envs_ppo --quick           # seconds
 
 Each task is trained once by examples/learn_ppo.py, from seed 0, and tested without the noise of the training in as many
-scenes that the training has not seen. A return is the sum of the rewards of an episode. The plan is the best one of
-examples/plan_tasks.py, for the scene of seed 0 alone.
+scenes that the training has not seen. A return is the sum of the rewards of an episode. The plans are the first guess
+and the best one by gradients of examples/plan_tasks.py, for the scene of seed 0 alone.
 """
 
 from __future__ import annotations
 
 import argparse
+import concurrent.futures
+import functools
+import multiprocessing
 import sys
 import time
 from collections.abc import Sequence
@@ -30,52 +33,61 @@ def example() -> Any:
     return learn_ppo
 
 
-def measure(names: Sequence[str], quick: bool) -> dict[str, Any]:
+def measure(names: Sequence[str], quick: bool, processes: int) -> dict[str, Any]:
+    """The tasks, in as many processes at a time, each with one thread."""
+    with common.one_thread():
+        environment = common.environment()
+    spawn = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(processes, spawn) as pool:
+        tasks = list(pool.map(functools.partial(measure_task, quick=quick), names))
+    return {"environment": environment | {"processes": processes}, "tasks": tasks}
+
+
+def measure_task(name: str, quick: bool) -> dict[str, Any]:
     learn = example()
-    result: dict[str, Any] = {"environment": common.environment(), "tasks": []}
-    for name in names:
-        training = learn.TRAININGS[name]
-        if quick:
-            training = training._replace(steps=240, scenes=2, steps_per_update=40)
+    training = learn.TRAININGS[name]
+    if quick:
+        training = training._replace(steps=240, scenes=2, steps_per_update=40)
+    with common.one_thread():
         begin = time.perf_counter()
         trained = learn.train(name, training)
         seconds = time.perf_counter() - begin
-        network, plan = learn.beside_the_plan(name, trained.policy, "cpu")
-        result["tasks"].append({
-            "name": name,
-            "training": {
-                "steps": trained.steps,
-                "scenes": training.scenes,
-                "failed": trained.failed,
-                "seconds": seconds,
-            },
-            "test": {
-                "untrained": trained.before.returns.mean().item(),
-                "trained": trained.after.returns.mean().item(),
-                "deviation": trained.after.returns.std().item(),
-                "success": trained.after.success.double().mean().item(),
-            },
-            "scene 0": {"trained": network, "plan": plan},
-            "curve": {
-                "steps": [steps for steps, _ in trained.curve],
-                "returns": [float(f"{value:.4g}") for _, value in trained.curve],
-            },
-        })  # fmt: skip
-        print({key: result["tasks"][-1][key] for key in ("name", "training", "test", "scene 0")}, flush=True)
+        network, first, best = learn.beside_the_plan(name, trained.policy, "cpu")
+    result = {
+        "name": name,
+        "training": {
+            "steps": trained.steps,
+            "scenes": training.scenes,
+            "failed": trained.failed,
+            "seconds": seconds,
+        },
+        "test": {
+            "untrained": trained.before.returns.mean().item(),
+            "trained": trained.after.returns.mean().item(),
+            "deviation": trained.after.returns.std().item(),
+            "success": trained.after.success.double().mean().item(),
+        },
+        "scene 0": {"trained": network, "first plan": first, "best plan": best},
+        "curve": {
+            "steps": [steps for steps, _ in trained.curve],
+            "returns": [float(f"{value:.4g}") for _, value in trained.curve],
+        },
+    }
+    print({key: result[key] for key in ("name", "training", "test", "scene 0")}, flush=True)
     return result
 
 
 def table(result: dict[str, Any]) -> str:
     header = (
-        "task", "steps", "scenes", "untrained", "trained", "deviation", "success", "trained, scene 0", "plan, scene 0",
-        "failed", "time [s]",
+        "task", "steps", "scenes", "untrained", "trained", "deviation", "success", "trained, scene 0",
+        "first plan, scene 0", "best plan, scene 0", "failed", "time [s]",
     )  # fmt: skip
     rows = []
     for task in result["tasks"]:
         test, training = task["test"], task["training"]
         rows.append((
             *(task["name"], training["steps"], training["scenes"], test["untrained"], test["trained"]),
-            *(test["deviation"], test["success"], task["scene 0"]["trained"], task["scene 0"]["plan"]),
+            *(test["deviation"], test["success"], *task["scene 0"].values()),
             *(training["failed"], training["seconds"]),
         ))  # fmt: skip
     return common.table(header, rows)
@@ -107,11 +119,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="few steps of one task, to see that it works")
     parser.add_argument("--tasks", nargs="+", choices=tuple(example().TRAININGS))
+    parser.add_argument("--processes", type=int, default=1, help="tasks that are trained at a time")
     parser.add_argument("--out", type=Path, default=common.RESULTS)
     arguments = parser.parse_args()
     names = arguments.tasks or (["push"] if arguments.quick else list(example().TRAININGS))
-    with common.one_thread():
-        result = measure(names, arguments.quick)
+    result = measure(names, arguments.quick, arguments.processes)
     common.write(arguments.out, "envs_ppo", result, text(result))
     plot(result, arguments.out / "envs_ppo.png")
 

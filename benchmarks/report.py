@@ -188,7 +188,8 @@ def learning(results: list[dict[str, Any]]) -> str:
         "groove.\n"
         "Columns of the test are means over scenes that the training has not seen, and the deviation among them; "
         "success is the share of scenes that reach their goal.\n"
-        "The plan by gradients is for one scene, in which the trained network is tested too."
+        "The plans are for one scene, in which the trained network is tested too: the first guess, and the best one by "
+        "gradients."
     )
     notes = [f"- {common.describe(result['environment'])}" for result in results]
     return "\n\n".join([intro, *map(envs_ppo.table, results), "\n".join(notes)])

@@ -26,23 +26,26 @@ from torch_mpm.envs.stable_baselines import StableBaselinesEnv
 
 class Training(NamedTuple):
     """Steps of the environment, in all scenes together; number of scenes; steps of each scene before an update, and how
-    often the update uses each of them."""
+    often the update uses each of them; rate of learning at the beginning, which falls to zero; discount of a step; and
+    logarithm of the standard deviation of the actions at the beginning."""
 
     steps: int
     scenes: int = 16
     steps_per_update: int = 20
     epochs: int = 10
+    learning_rate: float = 1e-3
+    discount: float = 0.98
+    log_deviation: float = -0.5
 
 
 TRAININGS = {
     "push": Training(40_000),
     "roll": Training(30_000),
-    "pour": Training(60_000),
+    "pour": Training(80_000, learning_rate=5e-4, discount=0.99, log_deviation=-1.5),
     "scoop": Training(20_000, epochs=20),
     "lift": Training(30_000),
     "write": Training(4_800, 8, epochs=20),
 }
-DISCOUNT = 0.98
 TEST = 10**6  # seed of the first scene of the test
 HIDDEN = 64  # neurons of both hidden layers, as in the networks of stable-baselines3
 
@@ -161,13 +164,13 @@ def make_model(name: str, training: Training, seed: int, device: str) -> PPO:
     env = StableBaselinesEnv(make_env(name, training.scenes, device, numpy=True))
     return PPO(
         "MlpPolicy",
-        VecNormalize(VecMonitor(env), gamma=DISCOUNT),
-        learning_rate=lambda left: 1e-3 * left,
+        VecNormalize(VecMonitor(env), gamma=training.discount),
+        learning_rate=lambda left: training.learning_rate * left,
         n_steps=training.steps_per_update,
         batch_size=training.scenes * training.steps_per_update // 4,
         n_epochs=training.epochs,
-        gamma=DISCOUNT,
-        policy_kwargs={"net_arch": [HIDDEN, HIDDEN], "log_std_init": -0.5},
+        gamma=training.discount,
+        policy_kwargs={"net_arch": [HIDDEN, HIDDEN], "log_std_init": training.log_deviation},
         seed=seed,
         device="cpu",  # The network is small.
     )
@@ -184,10 +187,10 @@ def train(name: str, training: Training, seed: int = 0, device: str = "cpu") -> 
     return Result(policy, model.num_timesteps, curve.points, curve.failed, before, after)
 
 
-def beside_the_plan(name: str, policy: nn.Module, device: str) -> tuple[float, float]:
-    """Returns of the network and of the best plan by gradients, in the scene of this plan."""
+def beside_the_plan(name: str, policy: nn.Module, device: str) -> tuple[float, float, float]:
+    """Returns of the network, and of the first and the best plan by gradients, in the scene of this plan."""
     _, rewards = improve(GUESSES[name], device)
-    return float(episode(make_env(name, 1, device), policy, 0).returns), max(rewards)
+    return float(episode(make_env(name, 1, device), policy, 0).returns), rewards[0], max(rewards)
 
 
 def plot(axes: Any, result: Result) -> None:
@@ -215,8 +218,8 @@ def main(name: str, out: Path, training: Training, seed: int = 0, device: str = 
     draw(name, result, out / f"{name}.png")
     before, after = (test.returns.mean() for test in (result.before, result.after))
     print(f"{name}: return {before:.4f} of the untrained network in the test, {after:.4f} of the trained one")
-    trained, planned = beside_the_plan(name, result.policy, device)
-    print(f"in scene 0: return {trained:.4f} of the network, {planned:.4f} of the plan by gradients")
+    trained, first, best = beside_the_plan(name, result.policy, device)
+    print(f"in scene 0: return {trained:.4f} of the network, {first:.4f} of the first plan, {best:.4f} by gradients")
     return result
 
 

@@ -19,23 +19,27 @@ from torch_mpm import envs
 
 
 class Guess(NamedTuple):
-    """First plan of a task: actions of phases, each for a number of steps; and the number of iterations."""
+    """First plan of a task: actions of phases, each for a number of steps; number of iterations, and their rate."""
 
     task: Callable[..., envs.MaterialEnv]
     dx: float
     iterations: int
     phases: Sequence[tuple[int, Sequence[float]]]
+    rate: float = 0.03
 
 
 GUESSES = {
     "push": Guess(envs.Push, 0.05, 15, [(30, (0.1, 0.0))]),
     "roll": Guess(envs.Roll, 0.05, 15, [(10, (0.0, -0.3)), (15, (0.3, 0.0)), (15, (-0.3, 0.0))]),
     "pour": Guess(envs.Pour, 0.04, 15, [(20, (0.5, 0.0, 0.0)), (60, (0.0, 0.0, -0.7))]),
-    "scoop": Guess(envs.Scoop, 0.03, 8, [(20, (0.0, -0.9, 0.0)), (20, (0.8, 0.0, 0.5)), (30, (0.0, 0.5, 0.8))]),
+    "scoop": Guess(
+        *(envs.Scoop, 0.03, 8),
+        [(20, (0.3, -0.9, -0.7)), (30, (0.9, 0.0, 0.0)), (20, (0.6, 0.2, 0.7)), (30, (0.0, 0.8, 0.3))],
+        rate=0.01,
+    ),
     "lift": Guess(envs.Lift, 0.03, 20, [(6, (0.4, -0.4, 0.0)), (24, (0.1, -0.1, 0.1))]),
-    "write": Guess(envs.Write, 0.04, 4, [(15, (0.0, 0.0, -0.5)), (25, (0.1, 0.1, 0.0))]),
+    "write": Guess(envs.Write, 0.04, 6, [(15, (0.0, 0.0, -0.5)), (25, (-0.1, 0.1, 0.0))]),
 }
-LEARNING_RATE = 0.03
 
 
 def first_plan(guess: Guess) -> Tensor:
@@ -55,7 +59,7 @@ def improve(guess: Guess, device: str = "cpu") -> tuple[Tensor, list[float]]:
     options: dict[str, Any] = {"autoreset_mode": "Disabled", "differentiable": True, "device": device}
     env = guess.task(1, guess.dx, **options)
     plan = first_plan(guess).to(device).requires_grad_()
-    optimizer = torch.optim.Adam([plan], lr=LEARNING_RATE)
+    optimizer = torch.optim.Adam([plan], lr=guess.rate)
     best, rewards = plan.detach().clone(), []
     for _ in range(guess.iterations):
         reward = total(env, plan)

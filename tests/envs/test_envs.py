@@ -431,8 +431,29 @@ def test_a_cup_pours():
     env = make(envs.Pour, 1)
     env.reset(seed=0)
     for k in range(110):
-        env.step(torch.tensor([[0.9, 0.0, 0.0] if k < 20 else [0.0, 0.0, -0.8]]))
+        *_, info = env.step(torch.tensor([[0.9, 0.0, 0.0] if k < 20 else [0.0, 0.0, -0.8]]))
+        if info["success"].any():
+            return
     assert float(env.share()) > 0.5
+
+
+def test_water_at_rest_in_the_glass_is_in_it():
+    """Its pressure moves some of it into the walls, less than half a cell."""
+
+    class Full(envs.Pour):
+        def scenes(self, random: torch.Tensor) -> envs.Scenes:
+            made = super().scenes(random)
+            return made._replace(fields=self.shifted(made.poses[:, 1, 0] - 0.12, self.thick))
+
+    env = make(Full, 1)
+    env.reset(seed=0)
+    *_, info = env.step(torch.zeros(1, 3))
+    assert info["success"].all()
+    env.success = lambda: torch.zeros_like(env.ended)
+    env.reset(seed=0)
+    for _ in range(60):
+        env.step(torch.zeros(1, 3))
+    assert float((env.distances() == 0).double().mean()) < 0.97 < float(env.share())
 
 
 def test_a_bucket_scoops():

@@ -32,7 +32,8 @@ class Pour(MaterialEnv):
 
     Score: −d, with the mean distance d of the particles of water from the inside of the glass, a box [m].
 
-    Success: 0.9 of the water is in the glass.
+    Success: 0.9 of the water is in the glass. Water counts up to half a cell inside its walls, where pressure moves it
+    (docs/limitations.md).
 
     Seeds choose the position of the glass.
 
@@ -82,8 +83,8 @@ class Pour(MaterialEnv):
         return torch.where(self.envs.present, norm(outside), 0.0)
 
     def share(self) -> Tensor:
-        """Share of the water in the glass [B]."""
-        inside = (self.distances() == 0) & self.envs.present
+        """Share of the water in the glass, or up to half a cell inside its walls [B]."""
+        inside = (self.distances() <= 0.5 * self.grid.dx) & self.envs.present
         return inside.sum(1).to(self.dtype) / self.envs.room
 
     def observation(self) -> Tensor:
