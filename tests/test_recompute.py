@@ -6,6 +6,7 @@ import sys
 import pytest
 import torch
 
+from benchmarks.speed import memory
 from torch_mpm.rollouts.recompute import called_again
 
 F64 = torch.float64
@@ -138,3 +139,34 @@ def test_no_compiler_is_imported():
     """An import would delay the first rollout with checkpoints by seconds."""
     done = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_placeholders_that_were_released_are_filled_again():
+    """Of nested calls whose results are read in any order, by backward passes of parts of them."""
+    x, y = inputs()
+    torch.manual_seed(7)
+    a, b = called_again(nested, x, y)
+    c, d = called_again(nested, a, b)
+    torch.manual_seed(7)
+    expected = [*nested(x, y)]
+    expected += nested(*expected)
+    for value, other in zip([a, b, c, d], expected, strict=True):
+        loss, plain = value.square().sum() + c.sum(), other.square().sum() + expected[2].sum()
+        found = torch.autograd.grad(loss, [x, y, WEIGHT], retain_graph=True)
+        assert all(map(torch.equal, found, torch.autograd.grad(plain, [x, y, WEIGHT], retain_graph=True)))
+
+
+def test_gradients_within_a_function_leave_nothing():
+    """Its energy is differentiated in it, as by laws of networks: the arguments alone remain."""
+    x = torch.linspace(0, 1, 1000, dtype=F64).requires_grad_()
+
+    def force(t):
+        (found,) = torch.autograd.grad(t.sin().square().sum(), t, create_graph=True)
+        return found * found.cos()
+
+    with memory.LiveTensors() as live:
+        result = called_again(force, x)
+        assert live.now <= 2 * x.numel() * x.element_size()
+    value = x.detach().requires_grad_()
+    expected = force(value)
+    assert torch.equal(torch.autograd.grad(result.sum(), x)[0], torch.autograd.grad(expected.sum(), value)[0])
