@@ -6,7 +6,9 @@ import sys
 import pytest
 import torch
 
+from benchmarks.catalogue.scenes import block_state
 from benchmarks.speed import memory
+from torch_mpm import Checkpoints, rollout
 from torch_mpm.rollouts.recompute import called_again
 
 F64 = torch.float64
@@ -170,3 +172,26 @@ def test_gradients_within_a_function_leave_nothing():
     value = x.detach().requires_grad_()
     expected = force(value)
     assert torch.equal(torch.autograd.grad(result.sum(), x)[0], torch.autograd.grad(expected.sum(), value)[0])
+
+
+@pytest.mark.parametrize("states", [None, 2])
+def test_gradients_within_steps_recompute_few_steps(states):
+    """Each step differentiates an energy. The forward pass computes each step once, and the first one again."""
+    count, n = [], 24
+
+    def step(state, dt):
+        count.append(None)
+        (force,) = torch.autograd.grad(state.x.sin().square().sum(), state.x, create_graph=True)
+        return state.replace(x=state.x - dt * force)
+
+    kept = Checkpoints(every=None if states else 6, states=states)
+    state = block_state(2)
+    x, plain = (state.x.clone().requires_grad_() for _ in range(2))
+    end = rollout(step, state.replace(x=x), n, 1e-2, kept)
+    assert len(count) <= n + 1
+    (gradient,) = torch.autograd.grad(end.x.sum(), x)
+    assert len(count) <= n + kept.repetitions(n) + 1
+    expected = state.replace(x=plain)
+    for _ in range(n):
+        expected = step(expected, 1e-2)
+    assert torch.equal(gradient, torch.autograd.grad(expected.x.sum(), plain)[0])

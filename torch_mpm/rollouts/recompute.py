@@ -30,12 +30,12 @@ def called_again(function: Callable[..., Any], *tensors: Tensor) -> Any:
         return function(*tensors)
     call = _Call(function, tensors)
     with torch.autograd.graph.saved_tensors_hooks(call.pack, call.unpack):
-        _RUNNING.calls.append(call)
+        running = _THREAD.running
+        running.calls.append(call)
         try:
             return function(*tensors)
         finally:
-            _RUNNING.calls.pop()
-            call.end()
+            running.leave(call)
 
 
 class _Arguments(torch.autograd.Function):
@@ -68,14 +68,32 @@ class _Place:
         self.values: dict[int, Tensor] = {}
 
 
-class _Running(threading.local):
-    """Calls whose function this thread computes for the first time, the innermost last."""
+class _Running:
+    """Calls whose function a thread computes for the first time, the innermost last."""
 
     def __init__(self) -> None:
         self.calls: list[_Call] = []
+        self.differentiate = False
+        """Whether the functions of the latest calls computed gradients in themselves."""
+        self._now = False
+
+    def note_gradient(self) -> None:
+        self._now = self.differentiate = True
+
+    def leave(self, call: _Call) -> None:
+        """End the function of the innermost call."""
+        self.calls.pop()
+        call.end()
+        if not self.calls:
+            self.differentiate, self._now = self._now, False
 
 
-_RUNNING = _Running()
+class _Thread(threading.local):
+    def __init__(self) -> None:
+        self.running = _Running()
+
+
+_THREAD = _Thread()
 _FILLED: dict[tuple[int, int], list[weakref.ref[_Call]]] = {}
 """Calls with filled placeholders, by the number of the backward pass and the thread."""
 
@@ -87,28 +105,40 @@ class _AllFound(Exception):
 class _Call:
     def __init__(self, function: Callable[..., Any], tensors: Sequence[Tensor]) -> None:
         self._function = function
-        self._outer = _RUNNING.calls[-1] if _RUNNING.calls else None
+        self._running: _Running | None = _THREAD.running  # Until the function ends; gradients in it may use a thread.
+        self._outer = self._running.calls[-1] if self._running.calls else None
         # The result, since its node releases its stored tensors when only Python holds it.
         self._arguments = _Arguments.apply(torch.empty(0, device="cpu", requires_grad=True), *tensors)
         self._place = 0 if self._outer is None else len(self._outer._places)  # After its arguments.
         self._places: list[weakref.ref[_Place]] = []
+        # Tensors with their versions until the function ends, where gradients computed in it read them.
+        self._held: dict[_Place, tuple[Tensor, int]] | None = {} if self._running.differentiate else None
         self._around = _surroundings({t.device for t in tensors})
 
     def pack(self, t: Tensor) -> _Place:
         place = _Place(t)
         self._places.append(weakref.ref(place))  # A tensor is then released with its user.
+        if self._held is not None:
+            self._held[place] = t.detach(), t._version
         return place
 
     def unpack(self, place: _Place) -> Tensor:
         backward: int = torch._C._current_graph_task_id()
         if backward == -1:  # A caller inspects a node.
             backward = uuid.uuid4().int
+        if self._running is not None:
+            self._running.note_gradient()
+            self._held = {} if self._held is None else self._held
+            held, version = self._held.get(place, (None, 0))
+            if held is not None and held._version == version:
+                return held
         if backward not in place.values:
             self._call_again(backward)
         return place.values.pop(backward)
 
     def end(self) -> None:
-        """Release what gradients that the function has computed itself have left."""
+        """Release what gradients computed in the function have read and left."""
+        self._held = self._running = None
         for reference in self._places:
             if (place := reference()) is not None:
                 place.values.clear()
