@@ -53,7 +53,8 @@ KEPT = {
     "every, offloaded": mpm.Checkpoints(every=4, offload=True),
     "two states": mpm.Checkpoints(states=2),
     "four states": mpm.Checkpoints(states=4),
-    "little memory": mpm.Checkpoints(memory=2.5e5),
+    "two states of three steps": mpm.Checkpoints(every=3, states=2),
+    "little memory": mpm.Checkpoints(memory=4.8e5),
     "much memory": mpm.Checkpoints(memory=1e9),
 }
 
@@ -222,34 +223,68 @@ def test_steps_and_kept_states_are_as_many_as_was_said(n, states):
 # ---- memory
 
 
-@pytest.mark.parametrize("memory", [3_000, 10_000, 50_000, 10_000_000])
-def test_what_fits_into_memory(memory):
-    """Stored states and the recorded steps between them do not exceed the given memory."""
-    state, step = 100, 700
-    kept = checkpoints.fitting(memory, 1000, state, step)
+NEEDS = checkpoints.Needs(state=100, step=150, call=400, path=1, steps_of_a_call=8.0, in_op=True)
+SINGLE = checkpoints.Needs(state=100, step=700)
+
+
+@pytest.mark.parametrize("needs", [NEEDS, SINGLE])
+@pytest.mark.parametrize("memory", [1_500, 3_000, 10_000, 50_000, 10_000_000])
+def test_what_fits_into_memory(memory, needs):
+    """Stored states and the recorded steps of a part do not exceed the given memory."""
+    n = 1000
+    kept = checkpoints.fitting(memory, n, needs)
     if kept is None:
-        assert memory >= state + 1000 * step
-    elif kept.states is not None:
-        assert kept.states * state + step <= memory
+        assert memory >= needs.bytes_of(1, n)
     else:
-        assert math.ceil(1000 / kept.every) * state + kept.every * step <= memory
-    assert (kept is not None and kept.states is not None) == (memory < 16_000)
-    away = checkpoints.fitting(memory, 1000, state, step, offload=True)
-    assert away is None or away.every * step <= memory
+        assert needs.bytes_of(kept.kept(n, needs.in_op) - needs.in_op, kept.every) <= memory < needs.bytes_of(1, n)
+    away = checkpoints.fitting(memory, n, needs, offload=True)
+    assert away is None or needs._replace(path=0).bytes_of(0, away.every) <= memory
+
+
+def time_of(kept, n, needs):
+    """Time of the computed steps and their calls, for parts of nearly equal length."""
+    computed = n + kept.repetitions(n, needs.in_op)
+    return computed + needs.steps_of_a_call * math.ceil(computed / kept.every)
+
+
+@pytest.mark.parametrize("needs", [NEEDS, SINGLE])
+@pytest.mark.parametrize("memory", [1_500, 2_000, 3_000, 5_000])
+def test_parts_take_the_least_time(memory, needs):
+    """By a search over all numbers of parts, and all numbers of states."""
+    n, times = 40, []
+    for parts in range(1, n + 1):
+        for states in range(2, n + 1):
+            kept = mpm.Checkpoints(every=math.ceil(n / parts), states=states)
+            if needs.bytes_of(kept.kept(n, needs.in_op) - needs.in_op, kept.every) <= memory:
+                times.append(time_of(kept, n, needs))
+    assert time_of(checkpoints.fitting(memory, n, needs), n, needs) <= min(times) + needs.steps_of_a_call
+
+
+def test_a_small_budget_needs_few_more_forward_passes():
+    """A tenth of the memory of all steps, and a fortieth, in calls of several steps."""
+    needs, n = NEEDS._replace(call=0, path=0), 1000
+    for share, repetitions, least in ((10, 1, 30), (40, 2, 8)):
+        kept = checkpoints.fitting(n * needs.step / share, n, needs)
+        assert kept.repetitions(n, in_op=True) <= repetitions * n and kept.every >= least
 
 
 def test_too_little_memory_is_said():
-    with pytest.raises(ValueError, match="memory must be at least 900 bytes, for a step and stored states, got 500"):
-        checkpoints.fitting(500, 10, 100, 700)
-    with pytest.raises(ValueError, match="memory must be at least"):
-        step, state = make("network", "cpu")
-        mpm.rollout(step, state, 5, DT, checkpoint=mpm.Checkpoints(memory=10))
+    words = "memory must be at least 753 bytes, for 2 stored states and the backward pass of 1 recorded step, got 500"
+    with pytest.raises(ValueError, match=words):
+        checkpoints.fitting(500, 10, NEEDS)
+    with pytest.raises(ValueError, match="memory must be at least 550 bytes, for the backward pass of 1 recorded step"):
+        checkpoints.fitting(500, 10, NEEDS, offload=True)
+    for kind in ("network", "one op"):
+        with pytest.raises(ValueError, match="memory must be at least"):
+            step, state = make(kind, "cpu")
+            v = state.v.clone().requires_grad_()
+            mpm.rollout(step, state.replace(v=v), 5, DT, checkpoint=mpm.Checkpoints(memory=10))
 
 
 def test_wrong_checkpoints():
     for arguments, message in (
-        ({}, "must have one of every, states and memory, got none"),
-        ({"every": 3, "states": 4}, "got every and states"),
+        ({}, "must have memory, or one or both of every and states, got none"),
+        ({"every": 3, "memory": 4e6}, "got every and memory"),
         ({"every": 0}, "every must be at least 1"),
         ({"states": 1}, "states must be at least 2"),
         ({"memory": -1.0}, "memory must be a positive number of bytes"),
@@ -286,10 +321,10 @@ def test_an_estimate_of_memory_is_what_autograd_keeps(device):
     assert step.status is before and torch.equal(torch.get_rng_state(), random)
     assert all(p.grad is None for p in (state.v, *step.parameters()))
     found, _ = kept_bytes(lambda: mpm.rollout(step, state, 20, DT))
-    assert estimate.memory == pytest.approx(found, rel=0.1)
+    assert found <= estimate.memory < 1.5 * found
     assert estimate.steps == 20 and estimate.seconds > 0
     less = mpm.estimate_rollout(step, state, 20, DT, checkpoint=mpm.Checkpoints(states=3), prefix=4)
-    assert less.memory < estimate.memory / 5 and less.kept_states == 3
+    assert less.memory < estimate.memory / 2 and less.kept_states == 3
     assert less.steps == 20 + mpm.Checkpoints(states=3).repetitions(16)
 
 
@@ -303,12 +338,16 @@ def test_an_estimate_of_a_rollout_in_one_op(device):
     assert mpm.estimate_rollout(step, state, 0, DT).steps == 0
 
 
-@pytest.mark.parametrize("kept", [None, 8, mpm.Checkpoints(memory=5e8)])
-def test_an_estimate_of_a_rollout_in_one_op_is_what_the_allocator_gives(kept, device):
-    """From above: of nodes it counts the most that may be kept."""
+@pytest.mark.parametrize("heated", [False, True])
+@pytest.mark.parametrize("kept", [None, 8, mpm.Checkpoints(states=3), mpm.Checkpoints(memory=3e8)])
+def test_an_estimate_of_a_rollout_in_one_op_is_what_the_allocator_gives(kept, heated, device):
+    """From above, as for small scenes in `test_rollout_memory.py`."""
     if device == "cpu":
-        pytest.skip("what an op holds inside is not seen on the CPU")
+        pytest.skip("the allocator of large tensors on the CPU has no counters")
     step, state = study.setup("compiled", 24, device)
+    if heated:
+        step.heat = mpm.Heat(step.grid, conductivity=50.0, specific_heat=100.0)
+        state = step.prepare(state.replace(temperature=state.x[:, 0].clone()))
     estimate = mpm.estimate_rollout(step, state, 40, DT, kept)
 
     def run():
@@ -316,7 +355,7 @@ def test_an_estimate_of_a_rollout_in_one_op_is_what_the_allocator_gives(kept, de
         torch.autograd.grad(mpm.rollout(step, state.replace(v=v), 40, DT, kept).x.sum(), v)
 
     run()
-    assert 0.4 < memory.of_cuda(run) / estimate.memory < 1.3
+    assert 0.3 < memory.of_cuda(run) / estimate.memory <= 1
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,9 @@ import sys
 import pytest
 import torch
 
+from benchmarks.catalogue.scenes import block_state
+from benchmarks.speed import memory
+from torch_mpm import Checkpoints, rollout
 from torch_mpm.rollouts.recompute import called_again
 
 F64 = torch.float64
@@ -138,3 +141,57 @@ def test_no_compiler_is_imported():
     """An import would delay the first rollout with checkpoints by seconds."""
     done = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_placeholders_that_were_released_are_filled_again():
+    """Of nested calls whose results are read in any order, by backward passes of parts of them."""
+    x, y = inputs()
+    torch.manual_seed(7)
+    a, b = called_again(nested, x, y)
+    c, d = called_again(nested, a, b)
+    torch.manual_seed(7)
+    expected = [*nested(x, y)]
+    expected += nested(*expected)
+    for value, other in zip([a, b, c, d], expected, strict=True):
+        loss, plain = value.square().sum() + c.sum(), other.square().sum() + expected[2].sum()
+        found = torch.autograd.grad(loss, [x, y, WEIGHT], retain_graph=True)
+        assert all(map(torch.equal, found, torch.autograd.grad(plain, [x, y, WEIGHT], retain_graph=True)))
+
+
+def test_gradients_within_a_function_leave_nothing():
+    """Its energy is differentiated in it, as by laws of networks: the arguments alone remain."""
+    x = torch.linspace(0, 1, 1000, dtype=F64).requires_grad_()
+
+    def force(t):
+        (found,) = torch.autograd.grad(t.sin().square().sum(), t, create_graph=True)
+        return found * found.cos()
+
+    with memory.LiveTensors() as live:
+        result = called_again(force, x)
+        assert live.now <= 2 * x.numel() * x.element_size()
+    value = x.detach().requires_grad_()
+    expected = force(value)
+    assert torch.equal(torch.autograd.grad(result.sum(), x)[0], torch.autograd.grad(expected.sum(), value)[0])
+
+
+@pytest.mark.parametrize("states", [None, 2])
+def test_gradients_within_steps_recompute_few_steps(states):
+    """Each step differentiates an energy. The forward pass computes each step once, and the first one again."""
+    count, n = [], 24
+
+    def step(state, dt):
+        count.append(None)
+        (force,) = torch.autograd.grad(state.x.sin().square().sum(), state.x, create_graph=True)
+        return state.replace(x=state.x - dt * force)
+
+    kept = Checkpoints(every=None if states else 6, states=states)
+    state = block_state(2)
+    x, plain = (state.x.clone().requires_grad_() for _ in range(2))
+    end = rollout(step, state.replace(x=x), n, 1e-2, kept)
+    assert len(count) <= n + 1
+    (gradient,) = torch.autograd.grad(end.x.sum(), x)
+    assert len(count) <= n + kept.repetitions(n) + 1
+    expected = state.replace(x=plain)
+    for _ in range(n):
+        expected = step(expected, 1e-2)
+    assert torch.equal(gradient, torch.autograd.grad(expected.x.sum(), plain)[0])

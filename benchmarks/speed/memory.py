@@ -1,4 +1,4 @@
-"""Peak memory of some work, measured in three ways."""
+"""Peak memory of some work, measured in four ways."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.profiler import ProfilerActivity
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
@@ -48,6 +49,26 @@ def of_returned_tensors(work: Work) -> int:
     with LiveTensors() as tensors:
         work()
     return tensors.most
+
+
+def of_host_allocator(work: Work) -> int:
+    """Memory of PyTorch's allocator on the host, also within ops [bytes].
+
+    Tensors of ops of 1 MiB or more are not included: the CPU library has an allocator of its own for these
+    (csrc/cpu/memory_cache.h).
+    """
+    gc.collect()
+    with torch.profiler.profile(activities=[ProfilerActivity.CPU], profile_memory=True, acc_events=True) as profile:
+        work()
+    events, allocations = list(profile.profiler.kineto_results.experimental_event_tree()), []
+    while events:
+        event = events.pop()
+        events += event.children
+        if event.name == "[memory]":
+            fields = event.extra_fields
+            allocations.append((event.start_time_ns, fields.total_allocated, fields.alloc_size))
+    _, total, size = min(allocations, default=(0, 0, 0))
+    return max((now for _, now, _ in allocations), default=0) - (total - size)
 
 
 def of_cuda(work: Work) -> int:

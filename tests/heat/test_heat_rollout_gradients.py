@@ -13,7 +13,7 @@ from benchmarks.catalogue.laws import named
 from torch_mpm import heat_boundaries
 from torch_mpm.laws.parameters import PerMaterial
 from torch_mpm.rollouts import plan_rollout
-from torch_mpm.rollouts.budget import bytes_of_a_substep
+from torch_mpm.rollouts.op_memory import recorded_bytes
 
 F64 = torch.float64
 STATE = ("x", "v", "C", "F", "J", "mass", "volume", "temperature")
@@ -538,7 +538,7 @@ def test_the_memory_is_known_beforehand(law):
     start, _ = with_leaves(step, step.prepare(state))
     arguments = mpm.substeps_arguments(step, start, 5, DT, records=True)
     record = torch.ops.torch_mpm.substeps(**arguments)[-1]
-    assert record is not None and record.numel() <= 5 * bytes_of_a_substep(state) + 4096
+    assert record is not None and record.numel() <= 5 * recorded_bytes(step, state) + 4096
 
 
 @pytest.mark.parametrize("law", ["neo_hookean", "wax"])

@@ -14,6 +14,7 @@ from ..geometry.per_scene import SceneParameters, per_node
 from ..geometry.timed import Path, at_each, tried, vector_at
 from ..geometry.values import Value, finite, shape_of_value
 from ..geometry.vectors import norm, transform
+from ..ops.autograd import graph_at_once
 from .waypoints import Waypoints
 
 PACE = 1e-4
@@ -183,7 +184,7 @@ class RigidMotion(SceneParameters):
         if centre.dim() > times.dim() + 1:
             return torch.stack([self._derivative(time)[1] for time in times.unbind()])
         trained = centre.requires_grad
-        with torch.inference_mode(False), torch.enable_grad():
+        with torch.inference_mode(False), torch.enable_grad(), graph_at_once():
             leaf = times.detach().clone().requires_grad_()
             again, _ = tried(lambda: at_each(self.at, leaf))
             if again is None:  # as of functions of NumPy, which have no derivative

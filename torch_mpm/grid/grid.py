@@ -238,8 +238,7 @@ class Grid(Lattice):
                 raise ValueError(
                     "a grid used under torch.compile needs max_blocks: pass it, or activate the grid once before"
                 )
-            wanted = self._activate(x, scene, None, 0).wanted
-            self.max_blocks = min(_with_headroom(wanted), self._most_blocks)
+            self.max_blocks = self.measured_pool(x, scene)
         elif (
             # This comes first: a compiled step would hold a reference to a temporary event.
             not torch.compiler.is_compiling()
@@ -252,6 +251,10 @@ class Grid(Lattice):
             if wanted * 4 > self.max_blocks * 3:
                 self.max_blocks = min(_with_headroom(wanted), self._most_blocks)
             self._pending = None
+
+    def measured_pool(self, x: Tensor, scene: Tensor | None) -> int:
+        """Number of blocks of a pool for these particles; waits for the device."""
+        return min(_with_headroom(self._activate(x, scene, None, 0).wanted), self._most_blocks)
 
     def watch(self, status: Tensor) -> None:
         """Adapt `max_blocks` to the `status` of an activation, without waiting for the device."""

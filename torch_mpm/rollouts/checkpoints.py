@@ -7,7 +7,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -24,24 +24,49 @@ Advance = Callable[[State, int, int], State]
 """Function of (state, count, k) that returns the state `count` steps later; the first of them is step k."""
 
 
+class Needs(NamedTuple):
+    """Memory and time of steps with gradients: what schedules of stored states are chosen by."""
+
+    state: int
+    """Size of a stored state [bytes]."""
+    step: int
+    """Size of a step that is recorded for its backward pass [bytes]."""
+    call: int = 0
+    """Size of everything else while recorded steps are differentiated [bytes]."""
+    path: int = 0
+    """Size of the arguments of a stored call, per step of it [bytes]."""
+    steps_of_a_call: float = 0.0
+    """Time of a call beside its steps, in steps."""
+    in_op: bool = False
+    """Whether a call stores its arguments, and its backward pass recomputes and records its steps: a call of the fused
+    op. Otherwise autograd records steps as they are computed."""
+
+    def bytes_of(self, states: int, steps: int) -> int:
+        """Memory of so many stored states while as many steps are recorded [bytes]."""
+        return states * (self.state + steps * self.path) + steps * (self.step + self.path) + self.call
+
+
 @dataclasses.dataclass(frozen=True)
 class Checkpoints:
-    """States of a rollout to store for the backward pass. Set exactly one of `every`, `states` and `memory`.
+    """States of a rollout to store for the backward pass. Set `memory`, or `every`, `states` or both.
 
     Attributes:
         every: stores the state of every `every` steps; each step is recomputed once. Memory: n/every states and the
             memory of `every` steps.
-        states: stores at most `states` states at a time, 2 or more, placed so that recomputation costs least (binomial
-            checkpoints, Griewank and Walther 2000). Memory: these states and the memory of one step; with s states and
-            at most r repetitions of each step, n ≤ (s + r)!/(s! r!).
+        states: stores at most `states` states at a time beside the initial one, 2 or more, placed so that recomputation
+            costs least (binomial checkpoints, Griewank and Walther 2000), at the beginnings of parts of `every` steps.
+            With s states and at most r repetitions of each part, the number of parts is at most (s + r)!/(s! r!).
+            Memory: these states and the memory of the steps of a part. Without `every` a part is one step from Python,
+            or the `graph` steps of `rollout`; in the fused op it has as many steps as need no more memory than the
+            states, or 16 MB (512 MB on CUDA), and at least one.
         memory: limit [bytes]. Where all steps fit, none is recomputed, as long as no grid has to grow on the CPU.
-            Otherwise the largest `every` that fits is used, or the number of `states` that fits where no `every` does.
-            A step launched from Python is run once without effect, to measure it.
+            Otherwise `every` and `states` are those that take the least time. Memory that allocators keep after the
+            tensors in it is not included. A step launched from Python is run once without effect, to measure it.
         offload: whether stored states on a CUDA device are moved to host memory; `memory` is then that of the
             recomputed steps. Not with `states`.
 
     Raises:
-        TypeError, ValueError: for a wrong number, or none or two of them.
+        TypeError, ValueError: for a wrong number, or none of them, or `memory` with another.
     """
 
     every: int | None = None
@@ -51,9 +76,9 @@ class Checkpoints:
 
     def __post_init__(self) -> None:
         given = [name for name in ("every", "states", "memory") if getattr(self, name) is not None]
-        if len(given) != 1:
+        if not given or (self.memory is not None and len(given) > 1):
             found = " and ".join(given) or "none"
-            raise ValueError(f"Checkpoints must have one of every, states and memory, got {found}")
+            raise ValueError(f"Checkpoints must have memory, or one or both of every and states, got {found}")
         if self.every is not None:
             check_count("every", self.every, 1)
         if self.states is not None:
@@ -65,16 +90,30 @@ class Checkpoints:
                 "offload must be False with states, got True: only every and memory move states to the host"
             )
 
-    def repetitions(self, n: int) -> int:
-        """Number of steps that the backward pass of n steps recomputes."""
-        if self.every is not None:
-            return n
-        assert self.states is not None
-        return _evaluations(n, min(self.states, n)) - n
+    def parts(self, n: int) -> int:
+        """Number of parts of n steps."""
+        return -(-n // (self.every or 1))
 
-    def kept(self, n: int) -> int:
-        """Maximum number of states stored at a time."""
-        return -(-n // self.every) if self.every is not None else min(self.states or 0, n)
+    def repetitions(self, n: int, in_op: bool = False) -> int:
+        """Number of steps that the backward pass of n steps recomputes.
+
+        Args:
+            n: number of steps.
+            in_op: whether each part is a call of the fused op, which recomputes its steps to record them.
+        """
+        if n == 0 or self.states is None:
+            return n
+        every, parts = self.every or 1, self.parts(n)
+        last, again = n - (parts - 1) * every, in_op or _recomputes_last(every, parts)
+        other_calls = _calls(parts, min(self.states, parts), in_op) - (2 if in_op else 1)
+        return every * other_calls + last * (2 if again else 1) - n
+
+    def kept(self, n: int, in_op: bool = False) -> int:
+        """Maximum number of states stored at a time; `in_op` as in `repetitions`."""
+        parts = self.parts(n)
+        if self.states is None:
+            return parts
+        return min(self.states + in_op, parts) if in_op else min(self.states, max(parts - 1, 1), n)
 
 
 def as_checkpoints(checkpoint: int | Checkpoints | None) -> Checkpoints | None:
@@ -88,32 +127,61 @@ def as_checkpoints(checkpoint: int | Checkpoints | None) -> Checkpoints | None:
     return Checkpoints(every=int(check_count("checkpoint", checkpoint, 1)))
 
 
-def fitting(memory: float, n: int, state_bytes: int, step_bytes: int, offload: bool = False) -> Checkpoints | None:
-    """Checkpoints of n steps with the least work within a limit of memory [bytes]; None where none are needed.
+def fitting(memory: float, n: int, needs: Needs, offload: bool = False) -> Checkpoints | None:
+    """Checkpoints of n steps that take the least time within a limit of memory [bytes]; None where none are needed.
+
+    The steps are divided into m = ⌈n / every⌉ parts. While a part is differentiated, its steps are recorded, and s
+    states are stored beside its own; `Needs.bytes_of` adds them up. For each length of a part the largest s that fits,
+    up to m − 1, determines how often parts are computed. Long parts save calls, and leave memory for fewer states, so
+    that parts are repeated more often. The length with the least time of steps and calls is chosen. With s = m − 1 each
+    part is recomputed once.
 
     Raises:
-        ValueError: where two states and a step need more.
+        ValueError: where no schedule fits. Each needs m − 1 states, or at least 2.
     """
-    if n == 0 or state_bytes + n * step_bytes <= memory:
+    if n == 0 or needs.bytes_of(0 if offload else 1, n) <= memory:
         return None
-    on_device = 0 if offload else state_bytes
+    if offload:
+        needs = needs._replace(state=0, path=0)
+    schedules = [s for every in _lengths(n) if (s := _largest(memory, n, every, needs)) is not None]
+    if not schedules:
+        least, states, steps = min((needs.bytes_of(*_least(n, k)), *_least(n, k)) for k in _lengths(n))
+        kept = "" if offload else f"{states} stored states and "
+        raise ValueError(
+            f"memory must be at least {least} bytes, for {kept}the backward pass of {steps} recorded "
+            f"{'step' if steps == 1 else 'steps'}, got {memory:g}"
+        )
+    fastest = min(schedules, key=lambda checkpoints: _time(checkpoints, n, needs))
+    return Checkpoints(every=fastest.every, offload=True) if offload else fastest
 
-    def needed(every: int) -> int:
-        return -(-n // every) * on_device + every * step_bytes
 
-    # All of them recompute each step once, and more steps between stored states mean fewer calls.
-    best = n if on_device == 0 else max(round(math.sqrt(n * on_device / max(step_bytes, 1))), 1)
-    smallest = 1 if on_device == 0 else min(best, n)
-    if needed(smallest) <= memory:
-        every = smallest
-        while needed(min(2 * every, n)) <= memory and every < n:
-            every = min(2 * every, n)
-        return Checkpoints(every=every, offload=offload)
-    states = int((memory - step_bytes) // max(on_device, 1))
-    if on_device == 0 or states < 2:
-        least = step_bytes + 2 * on_device
-        raise ValueError(f"memory must be at least {least} bytes, for a step and stored states, got {memory:g}")
-    return Checkpoints(states=min(states, n))
+def _lengths(n: int) -> Iterator[int]:
+    """Lengths ⌈n / m⌉ of m parts, from n to 1."""
+    every = n
+    while every > 1:
+        yield every
+        every = min(-(-n // (-(-n // every) + 1)), every - 1)
+    yield 1
+
+
+def _least(n: int, every: int) -> tuple[int, int]:
+    """Number of states that n steps in parts of a given length need, and of steps of a part."""
+    return min(-(-n // every) - 1, 2), every
+
+
+def _largest(memory: float, n: int, every: int, needs: Needs) -> Checkpoints | None:
+    """Checkpoints of parts of a given length with as many states as fit; None where too few do."""
+    most, without = -(-n // every) - 1, needs.bytes_of(0, every)
+    each = needs.bytes_of(1, every) - without
+    states = min((memory - without) // max(each, 1), most)
+    return Checkpoints(every=every, states=max(int(states), 2)) if states >= min(most, 2) else None
+
+
+def _time(checkpoints: Checkpoints, n: int, needs: Needs) -> float:
+    """Time of a rollout and of the recomputed steps of its backward pass, in steps."""
+    parts = checkpoints.parts(n)
+    calls = _calls(parts, min(checkpoints.states or parts, parts), needs.in_op)
+    return n + checkpoints.repetitions(n, needs.in_op) + needs.steps_of_a_call * calls
 
 
 # ---- every n-th step
@@ -179,25 +247,44 @@ class _EachTime(contextlib.AbstractContextManager[None]):
 # ---- binomial
 
 
-def binomial(advance: Advance, state: State, n: int, states: int, step: Any) -> State:
-    """The state n steps later, with at most `states` states stored at a time; n is 1 or more.
+def binomial(advance: Advance, state: State, n: int, checkpoints: Checkpoints, step: Any, in_op: bool = False) -> State:
+    """The state n steps later, with at most `states` states stored at a time beside the initial one; n is 1 or more.
 
-    The steps are split in two parts. The backward pass processes the second part first, with one state less; then it
-    recomputes the first part from its first state, with all states. The position of the split is that of Griewank and
-    Walther 2000 (algorithm 799, "revolve").
+    The parts of `every` steps are split in two groups. The backward pass processes the second group first, with one
+    state less; then it recomputes the first group from its first state, with all states. The position of the split is
+    that of Griewank and Walther 2000 (algorithm 799, "revolve"). It minimises the steps where autograd records them as
+    they are computed. A call of the fused op (`in_op`) recomputes its part itself: a group of one part is not wrapped,
+    and the number of calls is at most 2 % above the least.
     """
+    every = checkpoints.every or 1
 
-    def part_of(first: int, count: int, states: int) -> Advance:
-        return lambda now, *_: run(now, first, count, states)
+    parts = checkpoints.parts(n)
+
+    def part(state: State, k: int) -> State:
+        return advance(state, min(every, n - k * every), k * every)
+
+    def group(state: State, first: int, count: int, states: int) -> State:
+        def again(now: State, *_: int) -> State:
+            return run(now, first, count, states)
+
+        return recomputed(again, state, count * every, first * every, step)
 
     def run(state: State, first: int, count: int, states: int) -> State:
         while count > 1:
-            part = _split(count, states)
-            state = recomputed(part_of(first, part, states), state, part, first, step)
-            first, count, states = first + part, count - part, states - 1
-        return advance(state, 1, first)
+            size = _split(count, states)
+            state = part(state, first) if size == 1 and in_op else group(state, first, size, states)
+            first, count, states = first + size, count - size, states - 1
+        if first == parts - 1 and not in_op and _recomputes_last(every, parts):
+            return recomputed(lambda now, *_: part(now, first), state, every, first * every, step)
+        return part(state, first)
 
-    return run(state, 0, n, states)
+    return run(state, 0, parts, min(checkpoints.states or parts, parts))
+
+
+def _recomputes_last(every: int, parts: int) -> bool:
+    """Whether the last of several parts is recomputed, too, where autograd records steps as they are computed. What it
+    has recorded for nodes that no gradient reaches would remain until the end of the backward pass."""
+    return parts > 1 and every > 1
 
 
 def _reach(states: int, repetitions: int) -> int:
@@ -214,13 +301,14 @@ def _split(n: int, states: int) -> int:
 
 
 @functools.lru_cache(maxsize=1 << 16)
-def _evaluations(n: int, states: int) -> int:
-    """Number of steps that a rollout and its backward pass compute."""
-    computed = 1
-    while n > 1:
-        part = _split(n, states)
-        computed += part + _evaluations(part, states)
-        n, states = n - part, states - 1
+def _calls(parts: int, states: int, in_op: bool) -> int:
+    """Number of parts that a rollout and its backward pass compute, by `binomial`."""
+    of_one = 2 if in_op else 1  # A call of the op computes its part, and records it later.
+    computed = of_one
+    while parts > 1:
+        size = _split(parts, states)
+        computed += of_one if size == 1 and in_op else size + _calls(size, states, in_op)
+        parts, states = parts - size, states - 1
     return computed
 
 

@@ -13,7 +13,7 @@ from ..errors import check_count, shape_of
 from ..state.state import State
 from ..step.status import aside
 from ..step.step import Step
-from .budget import EVERYTHING, bytes_kept
+from .budget import EVERYTHING, needs_of
 from .checkpoints import Checkpoints, as_checkpoints
 from .hooks import Parts
 from .memory import differentiable, seconds
@@ -21,8 +21,8 @@ from .plan import RolloutPlan, plan_of_steps
 from .run import rollout
 from .steps import Steps
 
-TRIAL = 4
-"""Number of steps of the measurement."""
+TRIAL = 8
+"""Largest number of steps of the measurement."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,7 +30,8 @@ class RolloutEstimate:
     """Estimate of a rollout with gradients and its backward pass.
 
     Attributes:
-        memory: memory of stored states and of the steps that the backward pass holds at a time, on the device [bytes].
+        memory: upper bound of the memory of stored states and of the steps that the backward pass holds at a time with
+            the adjoints of one, on the device [bytes]. Memory that allocators keep after their tensors is not included.
         host_memory: memory of stored states that are offloaded to the host [bytes].
         seconds: run time [s], extrapolated from a few steps.
         kept_states: maximum number of states stored at a time.
@@ -101,25 +102,22 @@ def _estimate(
     """Estimate of n steps with gradients, as planned, after `prefix` steps without."""
     in_op, stores_all = plan.executor == "fused", plan.stores_all
     checkpoints = None if stores_all else plan.checkpoints
-    of_state, of_step = bytes_kept(step, start, dt, in_op)
+    needs = needs_of(step, start, dt, in_op)
     forward, both = _seconds_per_step(step, start, n, dt, plan)
     if n == 0:
         return RolloutEstimate(0, 0, prefix * forward, 0, prefix, len(start))
     if checkpoints is None and (stores_all or not in_op):
         run_time = prefix * forward + n * both
-        return RolloutEstimate(of_state + n * of_step, 0, run_time, 1, prefix + n, len(start))
-    if checkpoints is None:
-        checkpoints = Checkpoints(every=plan.steps_per_call)
-    states, recomputed = checkpoints.kept(n), checkpoints.repetitions(n)
-    extra = recomputed  # Recomputed steps whose time is not part of `both`.
-    if in_op:  # The backward pass of the op recomputes its own steps in any case.
-        extra, recomputed = (0, n) if checkpoints.every is not None else (recomputed, recomputed + n)
+        return RolloutEstimate(needs.bytes_of(1, n), 0, run_time, 1, prefix + n, len(start))
+    if checkpoints is None or checkpoints.every is None:
+        checkpoints = dataclasses.replace(checkpoints or Checkpoints(every=1), every=plan.steps_per_call)
+    states, recomputed = checkpoints.kept(n, in_op), checkpoints.repetitions(n, in_op)
+    extra = recomputed - n if in_op else recomputed  # Recomputed steps whose time is not part of `both`.
     run_time = prefix * forward + n * both + extra * forward
-    of_states, on_host = states * of_state, checkpoints.offload and start.x.is_cuda
-    of_steps = min(checkpoints.every or 1, n) * of_step
-    on_device = of_steps + (0 if on_host else of_states)
-    steps = prefix + n + recomputed
-    return RolloutEstimate(on_device, of_states if on_host else 0, run_time, states, steps, len(start))
+    every, on_host = min(checkpoints.every or 1, n), checkpoints.offload and start.x.is_cuda
+    memory = needs.bytes_of(0 if on_host else states - in_op, every)  # A call of the op includes its own state.
+    of_states = states * needs.state if on_host else 0
+    return RolloutEstimate(memory, of_states, run_time, states, prefix + n + recomputed, len(start))
 
 
 def _seconds_per_step(
@@ -127,14 +125,13 @@ def _seconds_per_step(
 ) -> tuple[float, float]:
     """Run time per step, without gradients and with the backward pass, of a few of n planned steps [s]."""
     trial = max(min(n, TRIAL), 1)
-    by_states = not plan.stores_all and plan.checkpoints is not None and plan.checkpoints.states is not None
-    calls = trial if by_states else 1  # Between stored states.
+    checkpoints = EVERYTHING
+    if plan.executor == "fused" and not plan.stores_all:
+        trial = max(min(n, TRIAL, plan.steps_per_call), 1)
+        checkpoints = Checkpoints(every=trial)
 
     def few_steps() -> State:
-        state = start
-        for _ in range(calls):
-            state = rollout(step, state, trial // calls, dt, EVERYTHING if plan.stores_all else None)
-        return state
+        return rollout(step, start, trial, dt, checkpoints)
 
     @torch.no_grad()
     def forward() -> None:

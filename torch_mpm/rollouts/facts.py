@@ -70,9 +70,9 @@ def facts_of(steps: Steps, state: State, stores_all: bool = False) -> Facts:
     assert isinstance(step, Step)
     gradients = wants_gradient(steps, state)
     records = gradients and stores_all and state.impulse is None and len(state) > 0
-    path_bytes = _path_bytes(step, steps, state) if step.boundaries.entries else 0
+    of_paths = path_bytes(step, steps, state)
     if not x.is_cuda:
-        return _facts_on_cpu(len(state), steps.n, state.ids is not None, gradients, records, path_bytes)
+        return _facts_on_cpu(len(state), steps.n, state.ids is not None, gradients, records, of_paths)
     grid, law = step.grid, step.law
     laws, moved = laws_of(law), law.state_fields
     return Facts(
@@ -104,7 +104,7 @@ def facts_of(steps: Steps, state: State, stores_all: bool = False) -> Facts:
         records,
         is_captured(x),
         graph_loops(),
-        path_bytes,
+        of_paths,
         len(_obstacles(step)),
         step.heat is not None,
         steps.bodies is not None,
@@ -129,7 +129,7 @@ def _is_uniform(law: Any) -> bool:
     return all(v.numel() == 1 for v in part.values() if isinstance(v, Tensor))
 
 
-def _path_bytes(step: Step, steps: Steps, state: State) -> int:
+def path_bytes(step: Step, steps: Steps, state: State) -> int:
     """Size of the table of obstacles on paths, per step [bytes]; zero without such obstacles, and with shapes that have
     no entry in a table."""
     if not follows_paths(step) or any(o.shape.number is None for o in _obstacles(step)):

@@ -52,7 +52,7 @@ def in_calls(steps: Steps, state: State, plan: RolloutPlan) -> State:
     if not with_gradient or plan.stores_all:
         return advance(state, n)
     if checkpoints is not None and checkpoints.states is not None and n > 0:
-        return binomial(advance, step.prepare(state), n, checkpoints.states, step)
+        return binomial(advance, step.prepare(state), n, checkpoints, step, in_op=True)
     with offloaded(state) if checkpoints is not None and checkpoints.offload else contextlib.nullcontext():
         return advance(state, n)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 from collections.abc import Callable
 from typing import Any
 
@@ -66,6 +67,21 @@ class Parts:
             return set()
         return set(range(self.n - self.truncate, self.first_with_gradient(), -self.truncate))
 
+    def stops(self) -> list[int]:
+        """Steps before which there is an action, in ascending order, with the first and the end."""
+        return sorted({0, self.first_with_gradient(), self.n} | self.cuts() | self._hooked() | self._measured())
+
+    def lengths_with_gradient(self) -> list[int]:
+        """Numbers of steps between two actions, of the steps that a gradient may reach."""
+        stops = [k for k in self.stops() if k >= self.first_with_gradient()]
+        return [following - k for k, following in itertools.pairwise(stops)]
+
+    def _hooked(self) -> set[int]:
+        return set() if self.hook is None else set(range(0, self.n, self.every))
+
+    def _measured(self) -> set[int]:
+        return set() if self.norms is None else set(self.norms.points(self.first_with_gradient(), self.n))
+
     def run(self, advance: Callable[[State, int, int], State], state: State, scales: Any, control: Control) -> State:
         """The state n steps later.
 
@@ -78,11 +94,9 @@ class Parts:
                 hook.
         """
         prefix, cuts = self.first_with_gradient(), self.cuts()
-        hooked = set() if self.hook is None else set(range(0, self.n, self.every))
-        measured = set() if self.norms is None else set(self.norms.points(prefix, self.n))
+        hooked, measured, stops = self._hooked(), self._measured(), self.stops()
         if self.norms is not None:
             self.norms.start(sorted(measured), *scales)
-        stops = sorted({0, prefix, self.n} | cuts | hooked | measured)
         ends = set() if isinstance(self.hook, Reader) else hooked
         began, control_steps = state, _ControlSteps(control, sorted({0, self.n} | ends))
         with control_steps:

@@ -17,9 +17,24 @@ StepFunction = Callable[[State, "float | Tensor"], State]
 
 
 def state_bytes(state: State) -> int:
-    """Size of the tensors that steps change [bytes]."""
+    """Size of the tensors that steps change, as the ops return them [bytes]."""
     fields = [getattr(state, f.name) for f in dataclasses.fields(state) if f.name not in (*CONSTANTS, "extra")]
-    return sum(_bytes(t) for t in [*fields, *state.extra.values()] if isinstance(t, Tensor))
+    return sum(_bytes(t, len(state)) for t in [*fields, *state.extra.values()] if isinstance(t, Tensor))
+
+
+def _bytes(t: Tensor, particles: int) -> int:
+    of_particles = t.dim() > 0 and len(t) == particles > 0
+    return rows_bytes(t, particles, t.numel() // particles) if of_particles else t.numel() * t.element_size()
+
+
+def rows_bytes(like: Tensor, particles: int, columns: int) -> int:
+    """Size of a structure of arrays: columns of the particles with their padding, `particle_pitch` in
+    csrc/common/tensors.h [bytes]."""
+    used = particles * like.element_size()
+    if not like.is_cuda:
+        line, page, shift = 64, 64, 23
+        used = ((-(-used // line) + page - 1 - shift) // page * page + shift) * line
+    return columns * used
 
 
 def step_bytes(step: StepFunction, state: State, dt: float | Tensor) -> int:
@@ -66,7 +81,3 @@ def seconds(work: Callable[[], Any], device: torch.device) -> float:
 def _wait(device: torch.device) -> None:
     if device.type == "cuda":
         torch.cuda.synchronize(device)
-
-
-def _bytes(t: Tensor) -> int:
-    return t.numel() * t.element_size()

@@ -14,7 +14,7 @@ from ..errors import check_count, shape_of
 from ..ops.arguments import check_choice, split_dt
 from ..state.state import State, check_state
 from ..step.step import Step
-from .budget import EVERYTHING, steps_of_a_call, within_budget
+from .budget import EVERYTHING, steps_of_a_call, with_parts, within_budget
 from .checkpoints import Checkpoints, as_checkpoints
 from .facts import Facts, facts_of
 from .reasons import why_not_fused, why_not_graphs, why_not_replay
@@ -71,7 +71,8 @@ class RolloutPlan:
         max_blocks: least number of blocks of the pool of the first call; None for those of the grid.
         sorts: whether particles are sorted before the steps, and restored to their order after them.
         checkpoints: which states are stored for the backward pass; None for those of the fused op itself, or for all.
-            `Checkpoints(memory=...)` has become the number of states that fits.
+            Those by a budget of memory, or by a number of states, have the length of their parts and the number of
+            states.
         reasons: why each other executor and schedule was not chosen, by name.
         forced: whether the schedule was given. Otherwise each call chooses in the same way.
         facts: facts of the first call; None for other executors.
@@ -144,8 +145,9 @@ def plan_rollout(
 ) -> RolloutPlan:
     """Plan of `rollout` with these arguments.
 
-    Nothing is computed or changed, and the host does not wait for the device. Exception: with a budget of memory for
-    steps from Python, one step is computed and dropped to measure its memory.
+    Nothing is computed or changed, and the host does not wait for the device. Exceptions, with a budget of memory: one
+    step from Python is computed and dropped to measure its memory, and the active blocks of a grid without a pool are
+    counted.
 
     Args:
         step, state, n, dt, checkpoint, graph: as `rollout`.
@@ -211,10 +213,12 @@ def _fused(steps: Steps, state: State, checkpoints: Checkpoints | None) -> Rollo
     plan = _planned(steps.schedule, facts)
     if checkpoints is None and not facts.gradients:
         return plan
-    steps_per_call = plan.steps_per_call
+    step, steps_per_call = steps.step, plan.steps_per_call
+    assert isinstance(step, Step)
     if facts.gradients and checkpoints is not EVERYTHING:
+        checkpoints = None if checkpoints is None else with_parts(checkpoints, step, state, steps.n)
         every = None if checkpoints is None else checkpoints.every
-        steps_per_call = min(steps_per_call, every or steps_of_a_call(state, steps.n))
+        steps_per_call = min(steps_per_call, every or steps_of_a_call(step, state, steps.n))
     return dataclasses.replace(plan, steps_per_call=steps_per_call, checkpoints=checkpoints)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -120,10 +121,11 @@ def _in_parts(steps: Steps, state: State, parts: Parts, plan: RolloutPlan | None
         state, grid = step.prepare(state), step.grid
         split_dt(steps.dt, grid.scenes, state.x)  # Checks dt.
         scales = grid.scenes, grid.dx, steps.dt
-    if torch.is_grad_enabled():  # The budget of memory is the same for all parts.
-        with_gradient = steps.part(steps.n - parts.first_with_gradient())
+    if torch.is_grad_enabled():  # The parts share the budget of memory: all of their first states are stored.
+        lengths = parts.lengths_with_gradient()
         fused = steps.checkpoints is not None and why_not_fused(step, state, steps.n, steps.dt) is None
-        steps = steps._replace(checkpoints=within_budget(with_gradient, state, fused))
+        with_gradient = steps.part(sum(lengths))
+        steps = steps._replace(checkpoints=within_budget(with_gradient, state, fused, lengths))
 
     def advance(state: State, count: int, k: int) -> State:
         return computed(steps.part(count, k), state, plan)
@@ -181,7 +183,8 @@ def _from_python(steps: Steps, state: State, plan: RolloutPlan) -> State:
     if isinstance(step, Step):
         state = step.prepare(state)
     if checkpoints.states is not None:
-        return binomial(advance, state, n, checkpoints.states, step)
+        parts = dataclasses.replace(checkpoints, every=checkpoints.every or plan.steps_per_call)
+        return binomial(advance, state, n, parts, step)
     return in_segments(advance, state, n, checkpoints, step)
 
 

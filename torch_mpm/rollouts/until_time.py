@@ -20,7 +20,7 @@ from .fused_op import in_calls
 from .graph_replay import CHUNK, replay_all
 from .plan import RolloutPlan, check_plan, plan_call, plan_of_steps
 from .run import rollout
-from .sorting import restore_order, sort_particles
+from .sorting import STEPS_IN_ORDER, STEPS_WITH_HEAT, restore_order, sort_particles
 from .steps import Steps
 
 SEGMENT = 16
@@ -79,7 +79,8 @@ def rollout_to(
     have as few; the last substeps of all scenes follow in one segment without a new choice.
 
     All of this is computed on the device of the particles. The host waits when it reads the number of remaining
-    substeps: at the beginning, after at most 64 segments, and before the last ones.
+    substeps: at the beginning, after at most 64 segments, and before the last ones. Particles that `rollout` would sort
+    are sorted as often, between segments, and restored to their order at the end; with gradients once.
 
     Args:
         step: the step; with `every` > 1 in one op per segment where `rollout` can do so.
@@ -116,9 +117,11 @@ def rollout_to(
         check_plan(plan, checkpoint=checkpoint, schedule=schedule)
     options = {"checkpoint": checkpoint, "schedule": schedule} if plan is None else {"plan": plan}
     given = _compensated(step, step.prepare(state), cfl, longest)
-    unsorted = plan_call(None, facts_of(Steps(step, 1, 1.0), given)._replace(steps=most)).order > 0
-    start = sort_particles(step, given) if unsorted else given
-    clocks = Clocks(step, start, time, cfl, longest, most, previous)
+    facts = facts_of(Steps(step, 1, 1.0), given)
+    order = plan_call(None, facts._replace(steps=most)).order
+    start = sort_particles(step, given) if order > 0 else given
+    lasts = None if order != 1 or facts.gradients else STEPS_IN_ORDER if step.heat is None else STEPS_WITH_HEAT
+    clocks = Clocks(step, start, time, cfl, longest, most, previous, lasts)
     with (
         step._error_status.call(state) as end_call,
         control_step(step, start, most, PACE, clocks.seconds) as end_motion,
@@ -128,7 +131,7 @@ def rollout_to(
         clocks.finish(counts, options)
         arrival = clocks.arrival()
         end = end_motion(arrival.state)
-        return arrival._replace(state=end_call(restore_order(step, end, start, given) if unsorted else end))
+        return arrival._replace(state=end_call(restore_order(step, end, clocks.start, given) if order > 0 else end))
 
 
 def _compensated(step: Step, state: State, cfl: float, longest: float) -> State:
@@ -144,7 +147,8 @@ def _compensated(step: Step, state: State, cfl: float, longest: float) -> State:
 class Clocks:
     """State whose scenes have times and time steps of their own, in float64: a float32 clock would not reach its end.
 
-    Graphs read and write the table of the clocks, so its address does not change.
+    Graphs read and write the table of the clocks, so its address does not change. Particles are sorted again after
+    `lasts` substeps; None for never. `start` is the state after the latest sort.
     """
 
     def __init__(
@@ -156,8 +160,10 @@ class Clocks:
         longest: float,
         most: int,
         previous: float | Tensor | None,
+        lasts: int | None = None,
     ) -> None:
-        self.step, self.state = step, state
+        self.step, self.state, self.start = step, state, state
+        self._lasts, self._since = lasts, 0  # Substeps since the latest sort.
         self._limits = cfl, longest, most
         end = _per_scene("time", time, step.grid.scenes, state.x)
         now = _per_scene("the time of the state", state.time, step.grid.scenes, state.x)
@@ -179,6 +185,18 @@ class Clocks:
 
     def advance(self, segments: int, n: int, options: dict[str, Any]) -> None:
         """Segments of n substeps each, for scenes with more than n remaining substeps; options of `rollout`."""
+        while segments > 0:
+            count = segments
+            if self._lasts is not None:
+                if self._since > 0 and self._since + n > self._lasts:
+                    self.state = self.start = sort_particles(self.step, self.state)
+                    self._since = 0
+                count = min(count, max((self._lasts - self._since) // n, 1))
+            self._advance_in_order(count, n, options)
+            segments, self._since = segments - count, self._since + count * n
+
+    def _advance_in_order(self, segments: int, n: int, options: dict[str, Any]) -> None:
+        """`advance` without a sort."""
         plan = self._plan_of_replays(n, options) if segments > LEAST_REPLAYS else None
         if plan is None:
             for _ in range(segments):
