@@ -76,8 +76,8 @@ class NearestSurface {
       if (distance < second_) second_ = distance;
       return;
     }
-    second_ = nearest_;
-    nearest_ = distance, own_ = other;
+    second_ = nearest_ < other ? nearest_ : other;
+    nearest_ = distance;
     if (!(distance <= farthest_)) return;
     if (pose.shape == ObstacleShape::box) {
       const int face = nearest_face(a_, pose, body);
@@ -92,7 +92,7 @@ class NearestSurface {
   // Of the obstacles that were given. `walled` is whether walls are near.
   MPM_HD NodeTouch<T, D> found(bool walled) {
     const T wall = walled ? nearest_wall(a_, position_) : std::numeric_limits<T>::max();
-    const bool joins = is_inside() && (has_joint() || (wall <= away() && !is_along_walls()));
+    const bool joins = is_inside() && (second_ <= away() || (wall <= away() && !is_along_walls()));
     if (joins || wall <= near_wall(a_)) touch_.obstacle = NodeTouch<T, D>::several;
     return touch_;
   }
@@ -103,7 +103,7 @@ class NearestSurface {
     NodeTouch<T, D> touch;
     if (nearest_ > farthest_) return touch;
     const bool outside = nearest_ > T(0.01 * a_.dx);
-    if ((is_inside() && !has_joint()) || (outside && own_ > farthest_ && second_ > farthest_)) {
+    if ((is_inside() && second_ > away()) || (outside && second_ > farthest_)) {
       if (is_along_walls(&sign)) return outside ? touch : touch_;
     }
     touch.obstacle = NodeTouch<T, D>::several;
@@ -118,12 +118,8 @@ class NearestSurface {
   // to √D.
   MPM_HD static T beside_wall(const ContactArguments<T, D>& a) { return T(1.001 * D) * seam_of(a); }
 
-  // Faces of the same obstacle and walls within this distance may join the nearest surface.
+  // Faces and walls within this distance may join the nearest surface.
   MPM_HD T away() const { return 2 * seam_of(a_) - nearest_; }
-
-  // Whether another face may join the nearest surface at an edge. The edge between two obstacles with an angle α is
-  // 1/sin(α/2) times as far from a node as that is deep, twice for 60 degrees.
-  MPM_HD bool has_joint() const { return own_ <= away() || second_ <= away() - nearest_; }
 
   // Whether the normal of the nearest surface and its velocity are parallel to all walls that are near, and to mirrors
   // that the node is behind. Contact with the surface alone then keeps the velocity that the walls gave the node.
@@ -143,9 +139,8 @@ class NearestSurface {
 
   const ContactArguments<T, D>& a_;
   const Vector<T, D> position_;
-  const T farthest_;                           // distance of the surfaces that count
-  T nearest_ = std::numeric_limits<T>::max();  // distance of the nearest obstacle
-  T own_ = nearest_, second_ = nearest_;       // of its second face, see `surface`; of the next obstacle
+  const T farthest_;  // distance of the surfaces that count
+  T nearest_ = std::numeric_limits<T>::max(), second_ = std::numeric_limits<T>::max();
   NodeTouch<T, D> touch_;
 };
 

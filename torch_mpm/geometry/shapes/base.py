@@ -174,7 +174,8 @@ def in_meridian(normal: Tensor, across: Tensor, axis: Tensor) -> Tensor:
 
 def perpendicular(axis: Tensor) -> Tensor:
     """Unit vectors [..., D] that are perpendicular to given ones."""
-    least = torch.nn.functional.one_hot(axis.abs().argmin(-1), axis.shape[-1]).to(axis.dtype)
+    axes = torch.arange(axis.shape[-1], device=axis.device)
+    least = (axis.abs().argmin(-1, keepdim=True) == axes).to(axis.dtype)
     return unit(least - (least * axis).sum(-1, keepdim=True) * axis)
 
 
