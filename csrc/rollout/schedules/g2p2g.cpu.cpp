@@ -134,6 +134,7 @@ class ChunkPass {
     if (i >= next.count) return;
     const int64_t p = next.id - t_.index + i;
     for (int k = 0; k < a_.to_nodes.prefetched_count; k++) __builtin_prefetch(a_.to_nodes.prefetched[k] + p, 0, 2);
+    if constexpr (Heat) heat_.prefetch(p);
   }
 
   void gather_out_of_block(int scene, int i) {
