@@ -32,7 +32,25 @@ struct HeatSolver {
         if (const int scene = scene_of(slot); wanted(scene)) f(slot, scene, slot * kBlockNodes<D>);
     });
   }
-  bool running(int scene) const { return scene >= 0 && w.scene[scene].running; }
+  bool running(int scene) const { return scene >= 0 && takes(scene) && w.scene[scene].running; }
+
+  // Whether the scene is solved here, and not by heat_simple_step().
+  bool takes(int scene) const { return !(a.leaves_simple && simple_steps(a, scene) > 0); }
+  bool takes_any() const {
+    bool any = false;
+    for (int scene = 0; scene < a.topology.scenes && !any; scene++) any = takes(scene);
+    return any;
+  }
+
+  // θ of the nodes, in the vector p where the solve reads their sums.
+  template <class Wanted>
+  const T* node_theta(const Wanted& wanted) const {
+    if (!a.sums) return a.theta;
+    for_slots(wanted, [&](int64_t, int, int64_t first) {
+      for (int64_t i = first; i < first + kBlockNodes<D>; i++) w.v.p[i] = theta_at(a, i);
+    });
+    return w.v.p;
+  }
 
   void start() const {
     const int64_t nodes = near_blocks(a) * int64_t(kBlockNodes<D>);
@@ -40,13 +58,13 @@ struct HeatSolver {
       T* const vectors[] = {w.v.product, w.v.inverse, w.v.weight};
       for (T* vector : vectors) __builtin_memset(vector + begin, 0, (end - begin) * sizeof(T));
     });
-    const auto all = [](int) { return true; };
+    const auto all = [&](int scene) { return takes(scene); };
     const auto nothing = [](int, double) {};
-    if (a.theta) sum_to<HeatSum::product>(a.theta, w.v.product, all, nothing);
+    if (has_theta(a)) sum_to<HeatSum::product>(node_theta(all), w.v.product, all, nothing);
     if (a.method == HeatMethod::chebyshev)
       sum_to<HeatSum::bound>(nullptr, w.v.weight, all, nothing);
     else
-      sum_to<HeatSum::diagonal>(nullptr, w.v.inverse, [&](int scene) { return simple_steps(a, scene) == 0; }, nothing);
+      sum_to<HeatSum::diagonal>(nullptr, w.v.inverse, all, nothing);
     for_slots(all, [&](int64_t slot, int scene, int64_t first) {
       auto sums = StartSums<T>::zero();
       const double dt = scene < 0 ? 1 : step_of_scene(a, scene);
@@ -58,36 +76,6 @@ struct HeatSolver {
     });
     for_scenes(all, w.start, StartSums<double>::zero(),
                [&](int scene, const StartSums<double>& sums) { w.scene[scene] = start_scene(a, scene, sums); });
-  }
-
-  // Solves the scenes for which a few steps without scalar products suffice.
-  void solve_by_simple_steps() const {
-    for (int k = 0; k < kMostSimpleSteps; k++) {
-      const auto takes = [&](int scene) { return running(scene) && w.scene[scene].simple > k; };
-      bool any = false;
-      for (int scene = 0; scene < a.topology.scenes; scene++) any |= takes(scene);
-      if (!any) break;
-      take_simple_step(k, takes);
-    }
-    for (int scene = 0; scene < a.topology.scenes; scene++)
-      if (running(scene) && w.scene[scene].simple > 0) finish_simple_steps(a, scene, w.scene[scene]);
-  }
-
-  // Step k, after the product for the residual that the step before has left.
-  template <class Takes>
-  void take_simple_step(int k, const Takes& takes) const {
-    if (k > 0) sum_to<HeatSum::product>(w.v.p, w.v.product, takes, [](int, double) {});
-    for_slots(takes, [&](int64_t, int scene, int64_t first) {
-      const int steps = w.scene[scene].simple;
-      const double c = bound_of_scene(a, scene);
-      const T omega = T(simple_weight(steps, k, c)), before = k > 0 ? T(simple_weight(steps, k - 1, c)) : T(0);
-      for (int64_t i = first; i < first + kBlockNodes<D>; i++) {
-        w.v.r[i] = (T(1) - before) * w.v.r[i] - before * w.v.product[i];
-        w.v.p[i] = w.v.inverse[i] * w.v.r[i];
-        a.increment[i] += omega * w.v.p[i];
-        w.v.product[i] = T(0);
-      }
-    });
   }
 
   // f(scene, sum over its slots); the order of the sums does not depend on threads.
@@ -130,21 +118,22 @@ struct HeatSolver {
   }
 
   void finish() const {
-    for_slots([](int scene) { return scene >= 0; },
+    for_slots([&](int scene) { return scene >= 0 && takes(scene); },
               [&](int64_t, int scene, int64_t first) {
                 const T shift = T(energy_shift(w.scene[scene]));
                 for (int64_t i = first; i < first + kBlockNodes<D>; i++)
                   if (w.v.mass[i] != T(0)) a.increment[i] += shift;
               });
-    for (int scene = 0; scene < a.topology.scenes; scene++) report_scene(a, scene, w.scene[scene]);
+    for (int scene = 0; scene < a.topology.scenes; scene++)
+      if (takes(scene)) report_scene(a, scene, w.scene[scene]);
   }
 };
 
 template <int Order, class T, int D>
 void heat_cg(const HeatArguments<T, D>& a) {
   const HeatSolver<Order, T, D> solver(a);
+  if (!solver.takes_any()) return;
   solver.start();
-  solver.solve_by_simple_steps();
   while (solver.iterate()) {
   }
   solver.finish();

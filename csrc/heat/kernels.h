@@ -30,12 +30,20 @@ MPM_BACKEND_KERNELS(MPM_HEAT_KERNELS)
   ORDERED(heat_to_particles, HeatToParticlesArguments)
 MPM_BACKEND_KERNELS(MPM_HEAT_TRANSFER_KERNELS)
 
+#define MPM_HEAT_SIMPLE_KERNELS(PLAIN, ORDERED, SIZE) \
+  ORDERED(heat_simple_step, HeatSimpleArguments)      \
+  PLAIN(heat_finish, HeatFinishArguments)
+MPM_BACKEND_KERNELS(MPM_HEAT_SIMPLE_KERNELS)
+
+#define MPM_HEAT_CPU_KERNELS(PLAIN, ORDERED, SIZE) PLAIN(heat_find_slots, HeatSlotsArguments)
+#if MPM_BACKEND == MPM_BACKEND_IS_cpu
+MPM_BACKEND_KERNELS(MPM_HEAT_CPU_KERNELS)
+#endif
+
 // On CUDA alone.
 #define MPM_HEAT_CUDA_KERNELS(PLAIN, ORDERED, SIZE) \
   ORDERED(heat_advance, HeatAdvanceArguments)       \
-  ORDERED(heat_exchange, ScatterArguments)          \
-  ORDERED(heat_simple_step, HeatSimpleArguments)    \
-  PLAIN(heat_finish, HeatFinishArguments)
+  ORDERED(heat_exchange, ScatterArguments)
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda
 MPM_BACKEND_KERNELS(MPM_HEAT_CUDA_KERNELS)
 #endif

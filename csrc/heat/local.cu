@@ -58,10 +58,7 @@ MPM_HD void finish_scene(const HeatFinishArguments<T, D>& a, int64_t scene) {
   const HeatArguments<T, D>& solve = a.simple.solve;
   if (a.displacement && simple_steps_of(kGrowth * bound_of_scene(solve, int(scene)), solve.relative_tolerance) == 0)
     request_activation(a.displacement);
-  if (simple_steps(solve, int(scene)) == 0)
-    count_solve(
-        HeatCountArguments<T, D>{solve.topology.scenes, solve.converged, solve.residual, solve.scene_dt, a.status},
-        scene);
+  if (simple_steps(solve, int(scene)) == 0) count_solve(count_of(a), scene);
 }
 
 template <class T, int D>

@@ -2,6 +2,7 @@
 
 #include <cmath>
 
+#include "common/elementary.h"
 #include "common/fields.h"
 #include "grid/topology.h"
 
@@ -26,18 +27,19 @@ enum HeatChannel : int { kHeatCapacity, kHeatVarying, kHeatTheta, kHeatMean, kHe
 template <class T, int D>
 struct HeatArguments {
   Topology<T, D> topology;
-  int near_blocks = 0;                 // slots that a solve considers, zero for all: on CUDA those in the order of
-                                       // scenes, before those without particles; on the CPU those with a block
-  Field<const T> x, conductance;       // conductance κ V [P]
-  const T* heat_capacity = nullptr;    // [N], as those below
-  const T* theta = nullptr;            // absent: zero
-  const T* sums = nullptr;             // on CUDA, in place of these two: [N, kHeatChannels] before any change
-  const T* source = nullptr;           // absent: zero
-  const T* exchange = nullptr;         // absent: zero
-  const bool* fixed = nullptr;         // absent: none
-  double dt = 0;                       // times scene_dt where given
-  const T* scene_dt = nullptr;         // [scenes]
-  double tolerance = 0;                // replaced by scene_tolerance where given
+  int near_blocks = 0;               // slots that a solve considers, zero for all: on CUDA those in the order of
+                                     // scenes, before those without particles; on the CPU those with a block
+  const bool* matter = nullptr;      // [slots] on the CPU, whether particles are transferred to the slot; may be absent
+  Field<const T> x, conductance;     // conductance κ V [P]
+  const T* heat_capacity = nullptr;  // [N], as those below
+  const T* theta = nullptr;          // absent: zero
+  const T* sums = nullptr;           // on CUDA, in place of these two: [N, kHeatChannels] before any change
+  const T* source = nullptr;         // absent: zero
+  const T* exchange = nullptr;       // absent: zero
+  const bool* fixed = nullptr;       // absent: none
+  double dt = 0;                     // times scene_dt where given
+  const T* scene_dt = nullptr;       // [scenes]
+  double tolerance = 0;              // replaced by scene_tolerance where given
   const T* scene_tolerance = nullptr;  // [scenes]
   double relative_tolerance = 0;       // of the first residual
   int most = 0;                        // maximum number of iterations, replaced by scene_most where given
@@ -54,12 +56,13 @@ struct HeatArguments {
   void* workspace = nullptr;  // bytes returned by heat_workspace()
 };
 
-// Products H u of the simple steps on CUDA, by kernels without barriers of the grid, from particles that may have left
-// their base blocks.
+// Products H u of the simple steps, from particles that may have left their base blocks; on CUDA by kernels without
+// barriers of the grid.
 template <class T, int D>
 struct HeatSimpleArguments {
   HeatArguments<T, D> solve;       // its increments are those of the other scenes
-  T* product[kMostSimpleSteps]{};  // [N] H θ, and H (M/dt + X)⁻¹ r after each step but the last; zero on entry
+  T* product[kMostSimpleSteps]{};  // [N] H θ, and H (M/dt + X)⁻¹ r after each step but the last; zero on entry on CUDA,
+                                   // and without θ the first one
   int step = 0;                    // number of the product
   bool packed = false;             // whether the particles are in the work space already
 };
@@ -201,7 +204,8 @@ MPM_HD void finish_simple_steps(const HeatArguments<T, D>& a, int scene, HeatSce
 
 template <class T>
 MPM_HD T mean_of(const T& sum, const T& weight) {
-  return weight > T(0) ? sum / weight : T(0);
+  const auto weighs = weight > T(0);
+  return select(weighs, sum / select(weighs, weight, T(1)), T(0));
 }
 
 template <class T, int D>
@@ -269,17 +273,22 @@ struct SimpleNode {
   T residual, increment, weight;  // M/dt + X, zero where the node is not free
 };
 
+// k of the simple steps at free nodes, where product(j + 1) is H (M/dt + X)⁻¹ r after step j. P is T or a pack.
+template <class T, class P, class F>
+MPM_HD void take_simple_steps(SimpleNode<P>& n, int steps, int k, double c, const F& product) {
+  for (int j = 0; j < k; j++) {
+    const P omega(simple_weight(steps, j, T(c)));
+    n.increment += omega * (n.residual / n.weight);
+    if (j + 1 < steps) n.residual = (P(1) - omega) * n.residual - omega * product(j + 1);
+  }
+}
+
 template <class T, int D>
 MPM_HD SimpleNode<T> simple_node(const HeatSimpleArguments<T, D>& a, int64_t row, int steps, int k, double c,
                                  double dt) {
   const NodeEquation<T> e = node_equation(a.solve, row, a.product[0][row], dt);
   SimpleNode<T> n{e.residual, T(0), e.weight};
-  if (!e.free) return n;
-  for (int j = 0; j < k; j++) {
-    const T omega = simple_weight(steps, j, T(c));
-    n.increment += omega * (n.residual / e.weight);
-    if (j + 1 < steps) n.residual = (T(1) - omega) * n.residual - omega * a.product[j + 1][row];
-  }
+  if (e.free) take_simple_steps<T>(n, steps, k, c, [&](int j) { return a.product[j][row]; });
   return n;
 }
 

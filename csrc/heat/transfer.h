@@ -165,6 +165,16 @@ struct HeatSurfaceArguments {
   NodeField<T> sums;  // kHeatChannels, zero on entry
 };
 
+// On the CPU: clears the sums of the slots that the substep before has used, and finds those of the next one.
+template <class T, int D>
+struct HeatSlotsArguments {
+  Topology<T, D> topology;
+  int64_t slots = 0;       // of the pool that may have a block
+  int order = 2;           // of the splines
+  T* sums = nullptr;       // [N, kHeatChannels]
+  bool* matter = nullptr;  // [slots] whether particles are transferred to the slot
+};
+
 enum class HeatTerm : int64_t { flux, convection, radiation, power };
 
 // Adds a term of the free surface, or the power, to the exchange and the source of the nodes.

@@ -58,14 +58,15 @@ class Copies {
     find_rows();
   }
 
-  // Copies consecutive particles from a place in memory on, with given rows of their affine fields.
-  void fetch_run(int position, int count, const T* affine, int line) {
+  // Copies consecutive particles from a place in memory on; affine(k) is row k of their affine fields.
+  template <class F>
+  void fetch_run(int position, int count, const F& affine) {
     position_ = position;
     count_ = count;
     stretches_ = 1;
     stretch_[0] = {position, 0, count};
     find_rows();
-    for (int k = 0; k < D * D; k++) given_[R::C + k] = affine + k * line;
+    for (int k = 0; k < D * D; k++) given_[R::C + k] = affine(k);
   }
 
   // Prefetches the cache lines of the i-th particle of the next call. The address may be wrong, even beyond the end of

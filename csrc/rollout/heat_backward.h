@@ -119,7 +119,7 @@ void HeatBackward<T, D>::make_nodes(const HeatSolution<T, D>& solution) {
   nodes_ = nodes;
   for (Tensor* t : {&source_, &multiplier_, &product_, &rate_}) *t = empty(in_.x, {nodes});
   adjoints_ = empty(in_.x, {nodes, 2});
-  if (MPM_BACKEND == MPM_BACKEND_IS_cuda) products_ = empty(in_.x, {kMostSimpleSteps, nodes});
+  products_ = empty(in_.x, {kMostSimpleSteps, nodes});
   forms_ = empty(in_.x, {nodes, kHeatForms});
   if (heat().holds_surface()) layer_ = empty(in_.x, {nodes});
   if (heat().has_terms()) surface_ = empty(in_.x, {nodes, kHeatChannels}), by_terms_ = empty(in_.x, {nodes});
@@ -172,18 +172,14 @@ void HeatBackward<T, D>::solve(HeatArguments<T, D> system, const Tensor& status)
   if (!workspace_.defined()) workspace_ = empty(in_.x, {backend::heat_workspace(system, stream_)}, ScalarType::Byte);
   system.workspace = workspace_.data_ptr();
   double* const counts = static_cast<double*>(status.data_ptr());
-#if MPM_BACKEND == MPM_BACKEND_IS_cuda
-  if (!system.deterministic) return solve_by_simple_steps(system, counts);
-#endif
+  if (MPM_BACKEND == MPM_BACKEND_IS_cpu || !system.deterministic) return solve_by_simple_steps(system, counts);
   backend::heat_cg(order(), system, stream_);
   backend::heat_count(HeatCountArguments<T, D>{in_.scenes, system.converged, system.residual, system.scene_dt, counts},
                       stream_);
 }
 
 template <class T, int D>
-void HeatBackward<T, D>::solve_by_simple_steps([[maybe_unused]] const HeatArguments<T, D>& system,
-                                               [[maybe_unused]] double* counts) {
-#if MPM_BACKEND == MPM_BACKEND_IS_cuda
+void HeatBackward<T, D>::solve_by_simple_steps(const HeatArguments<T, D>& system, double* counts) {
   backend::clear(products_, stream_);
   HeatFinishArguments<T, D> finish;
   finish.simple.solve = system;
@@ -191,7 +187,6 @@ void HeatBackward<T, D>::solve_by_simple_steps([[maybe_unused]] const HeatArgume
   finish.increment = system.increment;
   finish.status = counts;
   solve_simply(order(), finish, stream_);
-#endif
 }
 
 // H λ.

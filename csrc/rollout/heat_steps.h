@@ -20,7 +20,6 @@ struct HeatSolution {
   const T* theta;  // averages of the nodes [N]; null where the solve reads their sums
 };
 
-#if MPM_BACKEND == MPM_BACKEND_IS_cuda
 // Solves by simple steps where these suffice, and the other scenes by conjugate gradients.
 template <class T, int D>
 void solve_simply(int64_t order, HeatFinishArguments<T, D>& a, backend::Stream stream) {
@@ -33,7 +32,6 @@ void solve_simply(int64_t order, HeatFinishArguments<T, D>& a, backend::Stream s
   backend::heat_cg(order, simple.solve, stream);
   backend::heat_finish(a, stream);
 }
-#endif
 
 template <class T, int D>
 class HeatSteps {
@@ -184,7 +182,7 @@ class HeatSteps {
   bool has_gradient() const { return in_.heat.size() % 3 == 1; }
   bool exchanges() const { return holds_surface() || has_terms(); }
   // Whether scenes of few simple steps have kernels of their own. Sums on deterministic grids have an order.
-  bool takes_simple_steps() const { return MPM_BACKEND == MPM_BACKEND_IS_cuda && !in_.lattice.deterministic(); }
+  bool takes_simple_steps() const { return MPM_BACKEND == MPM_BACKEND_IS_cpu || !in_.lattice.deterministic(); }
   // Whether the solve reads the sums of the nodes. Boundaries and the adjoint need averages in arrays.
   bool solves_for_sums() const { return takes_simple_steps() && !for_record_ && !exchanges() && held_nodes() == 0; }
   // Whether G2P packs the particles for the simple steps; a held surface changes their conductance after it.
@@ -245,6 +243,7 @@ class HeatSteps {
   T *sums_ = nullptr, *exchange_ = nullptr, *source_ = nullptr, *surface_ = nullptr;
   T* product_[kMostSimpleSteps] = {};
   Tensor theta_, capacity_, increment_, iterations_, residual_, converged_, workspace_;
+  Tensor matter_;  // on the CPU: slots to which particles are transferred
 };
 
 template <class T, int D>
@@ -419,6 +418,10 @@ void HeatSteps<T, D>::make_nodes(backend::Stream stream) {
     increment_ = empty(in_.x, {nodes});
     if (held_nodes() > 0) start_ = empty(in_.x, {nodes}), fixed_ = empty(in_.x, {nodes}, ScalarType::Bool);
     workspace_ = Tensor();
+#if MPM_BACKEND == MPM_BACKEND_IS_cpu
+    matter_ = empty(in_.x, {slots}, ScalarType::Bool);
+    backend::clear(matter_, stream);
+#endif
     for (int turn = 0; turn < kTurns; turn++) {
       cleared_[turn] = empty(in_.x, {lay_out_cleared(nullptr, nodes)});
       backend::clear(cleared_[turn], stream);
@@ -429,7 +432,13 @@ void HeatSteps<T, D>::make_nodes(backend::Stream stream) {
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
   const int64_t used = used_slots() * kBlockNodes<D>, scalar = sizeof(T);
   clear_memory(largest_, in_.scenes * int64_t(sizeof(double)));
-  clear_memory(sums_, used * kHeatChannels * scalar);
+  HeatSlotsArguments<T, D> touched;
+  touched.topology = s_.p2g.topology;
+  touched.slots = slots;  // an earlier activation may have used more of them
+  touched.order = int(in_.lattice.order());
+  touched.sums = sums_;
+  touched.matter = static_cast<bool*>(matter_.data_ptr());
+  backend::heat_find_slots(touched, stream);
   for (T* const of_nodes : {exchange_, source_})
     if (of_nodes) clear_memory(of_nodes, used * scalar);
   if (surface_) clear_memory(surface_, used * kHeatChannels * scalar);
@@ -588,6 +597,7 @@ template <class T, int D>
 HeatArguments<T, D> HeatSteps<T, D>::equations(const Field<const T>& x, backend::Stream stream) {
   HeatArguments<T, D> a;
   a.topology = s_.p2g.topology;
+  if (matter_.defined()) a.matter = static_cast<const bool*>(matter_.data_ptr());
   a.near_blocks = int(MPM_BACKEND == MPM_BACKEND_IS_cpu ? used_slots() : s_.activation.max_blocks);
   a.x = x;
   a.conductance = field<const T>(conductance_);
@@ -643,13 +653,11 @@ void HeatSteps<T, D>::use_increments(const HeatArguments<T, D>& a, const T* incr
                            stream);
 }
 
-// Solves the equations on CUDA, where scenes of simple steps have kernels of their own. These allow particles that have
-// left their base blocks. The solver of the other scenes does not, so an activation is requested where a scene may soon
-// be one.
+// Solves the equations where scenes of simple steps have kernels of their own. These allow particles that have left
+// their base blocks. On CUDA the solver of the other scenes does not, so an activation is requested where a scene may
+// soon be one.
 template <class T, int D>
-void HeatSteps<T, D>::solve_by_simple_steps([[maybe_unused]] HeatArguments<T, D>& a,
-                                            [[maybe_unused]] backend::Stream stream) {
-#if MPM_BACKEND == MPM_BACKEND_IS_cuda
+void HeatSteps<T, D>::solve_by_simple_steps(HeatArguments<T, D>& a, backend::Stream stream) {
   HeatFinishArguments<T, D> finish;
   finish.simple.solve = a;
   finish.simple.packed = s_.with_heat.workspace != nullptr;
@@ -661,7 +669,6 @@ void HeatSteps<T, D>::solve_by_simple_steps([[maybe_unused]] HeatArguments<T, D>
   finish.status = rows_of_status();
   finish.displacement = s_.advance.displacement;
   solve_simply(in_.lattice.order(), finish, stream);
-#endif
 }
 
 }  // namespace mpm

@@ -49,17 +49,59 @@ struct LastAxis {
       : z(f - P(1)), four_z(P(4) * z), moment(z * (P(3) - four_z * z)), two_z(P(2) * z) {}
 };
 
-// For one channel; the moments are about the second nodes, except that of the last axis, which is about the particle.
-template <int Axis, bool Gradient, class T, int D>
-MPM_HD Sums<Lanes<T>, D - Axis> sum_lines(const Weights<2, Lanes<T>, D>& s, const LastAxis<Lanes<T>>& last,
-                                          const T* lines) {
-  using P = Lanes<T>;
+// Two channels of each particle side by side.
+template <class T>
+using Pairs = Pack<T, 2 * kLanes>;
+// Whether a register holds them, which halves the instructions.
+#ifdef __AVX512F__
+template <class T>
+constexpr bool kHasPairs = sizeof(T) == 4;
+#else
+template <class T>
+constexpr bool kHasPairs = false;
+#endif
+
+// A channel in all lanes, or it and the next one in pairs of lanes.
+template <class T>
+MPM_HD void spread_channel(const T* from, Lanes<T>& to) {
+  to = Lanes<T>(from[0]);
+}
+#ifdef __AVX512F__
+MPM_HD void spread_channel(const float* from, Pairs<float>& to) {
+  long long pair;
+  __builtin_memcpy(&pair, from, sizeof(pair));
+  to.part[0] = _mm512_castsi512_ps(_mm512_set1_epi64(pair));  // one instruction, unlike a shuffle
+}
+#endif
+
+// The same values for both channels; and those of one channel.
+template <class T>
+MPM_HD Pairs<T> for_both(const Lanes<T>& v) {
+  Pairs<T> r;
+  r.part[0] = __builtin_shufflevector(v.part[0], v.part[0], 0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 5, 5, 6, 6, 7, 7);
+  return r;
+}
+template <int Channel, class T>
+MPM_HD Lanes<T> of_channel(const Pairs<T>& v) {
+  constexpr int c = Channel;
+  Lanes<T> r;
+  r.part[0] = __builtin_shufflevector(v.part[0], v.part[0], c, 2 + c, 4 + c, 6 + c, 8 + c, 10 + c, 12 + c, 14 + c);
+  return r;
+}
+
+// For one channel, or a pair of them; the moments are about the second nodes, except that of the last axis, which is
+// about the particle.
+template <int Axis, bool Gradient, class T, int D, class P>
+MPM_HD Sums<P, D - Axis> sum_lines(const Weights<2, P, D>& s, const LastAxis<P>& last, const T* lines) {
   using L = Lines<T, D>;
   if constexpr (Axis + 1 < D) {
     return sum_axis<2, Axis, true, Gradient>(
         s, [&](int k) { return sum_lines<Axis + 1, Gradient>(s, last, lines + k * L::stride(Axis)); });
   } else {
-    const P a(lines[0]), b(lines[L::kCells]), c(lines[2 * L::kCells]);
+    P a, b, c;
+    spread_channel(lines, a);
+    spread_channel(lines + L::kCells, b);
+    spread_channel(lines + 2 * L::kCells, c);
     Sums<P, 1> r;
     r.value = fma(last.four_z, fma(c, last.z, b), a);
     r.moment[0] = fma(c, last.moment, b);
@@ -68,10 +110,9 @@ MPM_HD Sums<Lanes<T>, D - Axis> sum_lines(const Weights<2, Lanes<T>, D>& s, cons
   }
 }
 
-// As gather_channels, with moments.
-template <int Channels, bool Gradient, class T, int D>
-MPM_HD void gather_lines(const Lanes<T> f[D], const T* lines, Sums<Lanes<T>, D> sums[Channels]) {
-  using P = Lanes<T>;
+// As gather_channels, with moments; for `Channels` channels, or pairs of them.
+template <int Channels, bool Gradient, class T, int D, class P>
+MPM_HD void gather_lines(const P f[D], const T* lines, Sums<P, D> sums[Channels]) {
   const Weights<2, P, D> s(f, Gradient ? 1 : 0);
   const LastAxis<P> last(f[D - 1]);
   MPM_UNROLL for (int c = 0; c < Channels; c++) {

@@ -134,6 +134,7 @@ class ChunkPass {
     if (i >= next.count) return;
     const int64_t p = next.id - t_.index + i;
     for (int k = 0; k < a_.to_nodes.prefetched_count; k++) __builtin_prefetch(a_.to_nodes.prefetched[k] + p, 0, 2);
+    if constexpr (Heat) heat_.prefetch(p);
   }
 
   void gather_out_of_block(int scene, int i) {
@@ -180,11 +181,7 @@ class ChunkPass {
         if (!Heat) write_motion(p, rows_, g);
         return;
       }
-      if constexpr (Heat) {
-        put(present_volume(p, g), a_.volume_next, g);
-        MPM_UNROLL for (int k = 0; k < D; k++)
-          p.v[k].store(motion_.velocity[k] + i);
-      }
+      if constexpr (Heat) return put(present_volume(p, g), a_.volume_next, g);
       MPM_UNROLL for (int k = 0; k < D * D; k++)
         p.affine[k / D][k % D].store(motion_.affine[k / D][k % D] + i);
     });
@@ -196,10 +193,26 @@ class ChunkPass {
     return rows_.J ? rest * p.J : rows_.F ? rest * determinant(p.F) : rest;
   }
 
+  // Motion of the particles of the chunk from the i-th one on: with heat from their rows, which an earlier pass has
+  // written.
+  template <class G>
+  MPM_HD P velocity(int k, int i, const G& g) const {
+    if constexpr (Heat) return load_row(rows_.v.row[k], 1, g);
+    return P::load(motion_.velocity[k] + i);
+  }
+  template <class G>
+  MPM_HD P affine(int k, int i, const G& g) const {
+    if constexpr (Heat) return load_row(rows_.affine.row[k], 1, g);
+    return P::load(affine_row(k) + i);
+  }
+  MPM_HD const T* affine_row(int k) const {
+    return Heat ? rows_.affine.row[k] + chunk_.begin : motion_.affine[k / D][k % D];
+  }
+
   // Laws, and contributions of the particles to the nodes.
   void give(const BaseBlock<T, D>& base_block) {
     const P2GArguments<T, D>& p2g = a_.to_nodes.p2g;
-    copies_.fetch_run(chunk_.begin, chunk_.count, motion_.affine[0][0], motion_.kLine);
+    copies_.fetch_run(chunk_.begin, chunk_.count, [this](int k) { return affine_row(k); });
     copies_.apply_laws();
     const P dt(time_step(p2g.scene_dt, p2g.dt, base_block.scene));
     chunk_.template for_packs<N>([&](int i, const auto& g) {
@@ -210,9 +223,9 @@ class ChunkPass {
       p.dt = dt;
       MPM_UNROLL for (int a = 0; a < D; a++) {
         x[a] = load_row(rows_.x_next.row[a], 1, g);
-        p.velocity[a] = P::load(motion_.velocity[a] + i);
+        p.velocity[a] = velocity(a, i, g);
         MPM_UNROLL for (int b = 0; b < D; b++)
-          p.affine[a][b] = p2g.affine.pointer ? P::load(motion_.affine[a][b] + i) : P(0);
+          p.affine[a][b] = p2g.affine.pointer ? affine(a * D + b, i, g) : P(0);
       }
       p.stress = load_matrix_or_zero<T, D>(copies_.field(R::stress), RunOf<N>{i});
       find_cells(i, base_block, x, f);

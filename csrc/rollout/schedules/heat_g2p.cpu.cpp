@@ -24,6 +24,8 @@ class HeatChunkPass {
       prefetched_[count_++] = rows_.x_next.row[d];
       if (p.gradient.pointer) prefetched_[count_++] = row_of(p.gradient, d);
     }
+    for (const Field<T>& f : {a.to_nodes.conductance, a.to_nodes.blend, a.to_nodes.number})
+      if (f.pointer) written_[written_count_++] = f.pointer;
   }
 
   // `my_turn` waits for the sums of earlier colours.
@@ -76,6 +78,7 @@ class HeatChunkPass {
     if (i >= next.count) return;
     const int64_t p = next.id - t_.index + i;
     for (int k = 0; k < count_; k++) __builtin_prefetch(prefetched_[k] + p, 0, 2);
+    for (int k = 0; k < written_count_; k++) __builtin_prefetch(written_[k] + p, 1, 2);
     MPM_UNROLL for (int k = 0; k < D; k++)
       __builtin_prefetch(rows_.v.row[k] + p, 1, 2);
     MPM_UNROLL for (int k = 0; k < D * D; k++)
@@ -125,7 +128,8 @@ class HeatChunkPass {
   const AdvancedRows<T, D> rows_;
   ChannelRow<T>* const nodes_;
   const T* prefetched_[3 + 2 * D];
-  int count_ = 0;
+  T* written_[3];
+  int count_ = 0, written_count_ = 0;
   Largest<T> largest_;
   uint8_t near_[kChunk];  // of particles out of the block: their cells among the kNear^D cells around
   Motion<false, T, D> motion_;

@@ -14,6 +14,12 @@ class HeatGather {
   explicit HeatGather(const HeatToParticlesArguments<T, D>* a)
       : a_(*a), rows_(reinterpret_cast<const ChannelRow<T>*>(a->nodes.pointer - kHeatTheta)) {}
 
+  // Prefetches a particle, without the fields of the step.
+  MPM_HD void prefetch(int64_t p) const {
+    __builtin_prefetch(a_.blend.pointer + p, 0, 2);
+    if (a_.liquid.pointer) __builtin_prefetch(a_.number.pointer + p, 0, 2);
+  }
+
   void begin(const BaseBlock<T, D>& base_block) {
     tile_.load_from(a_.nodes, base_block, 0, kFields);
     lines_.load_from(tile_);
@@ -23,7 +29,7 @@ class HeatGather {
     const T* at = lines_.value + lines_.at(base);
     asm volatile("" : "+r"(at));  // as for velocities
     Sums<Lanes<T>, D> s[kFields];
-    gather_lines<kFields, false, T, D>(f, at, s);
+    gather_fields(f, at, s);
     g.template store_by<T>([&](const auto& store) { put_by(store, s); });
   }
 
@@ -55,6 +61,22 @@ class HeatGather {
  private:
   static constexpr int kFields = kHeatChannels - kHeatTheta;  // increment and θ̄
   static constexpr int kLine = Motion<false, T, D>::kLine;
+
+  MPM_HD static void gather_fields(const Lanes<T> f[D], const T* lines, Sums<Lanes<T>, D> s[kFields]) {
+    if constexpr (kHasPairs<T>) {
+      static_assert(kFields == 2);
+      Pairs<T> distance[D];
+      MPM_UNROLL for (int a = 0; a < D; a++)
+        distance[a] = for_both(f[a]);
+      Sums<Pairs<T>, D> both;
+      gather_lines<1, false, T, D>(distance, lines, &both);
+      s[0].value = of_channel<0>(both.value), s[1].value = of_channel<1>(both.value);
+      MPM_UNROLL for (int a = 0; a < D; a++)
+        s[0].moment[a] = of_channel<0>(both.moment[a]), s[1].moment[a] = of_channel<1>(both.moment[a]);
+    } else {
+      gather_lines<kFields, false, T, D>(f, lines, s);
+    }
+  }
 
   template <class F, class V>
   MPM_HD void put_by(const F& store, const Sums<V, D> s[kFields]) {

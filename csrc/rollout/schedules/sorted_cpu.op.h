@@ -133,7 +133,7 @@ SortedCpu<T, D>::SortedCpu(Substeps<T, D>& steps, const Tensor& packed_history, 
   volume_ = {like, s_.p2g.volume, {P}};
   if (s_.columns > 0) history = OwnField<T>(packed_history);
   if (s_.flips()) kept_ = OwnField<T>(s_.kept);
-  if (HeatSteps<T, D>::wanted(in_)) heat.emplace(s_);
+  if (HeatSteps<T, D>::wanted(in_)) heat.emplace(s_), heat->leave_no_record();
   if (has(in_.scene)) scene_ = {like, field<const int>(*in_.scene), {P}};
   if (has(in_.material)) material_ = {like, field<const int>(*in_.material), {P}};
   s_.forget_stress();
