@@ -100,7 +100,7 @@ class NearestSurface {
   // Of a node at a wall or beyond, seen from the point of the wall; `sign` as `within_walls` gives it. A surface that
   // is perpendicular to the wall leaves no gap beside it; points beside the wall may be nearer to it by its curvature.
   MPM_HD NodeTouch<T, D> at_wall(const Vector<T, D>& sign) {
-    NodeTouch<T, D> touch;
+    NodeTouch<T, D> touch = {};
     if (nearest_ > farthest_) return touch;
     const bool outside = nearest_ > T(0.01 * a_.dx);
     if ((is_inside() && second_ > away()) || (outside && second_ > farthest_)) {
@@ -141,7 +141,7 @@ class NearestSurface {
   const Vector<T, D> position_;
   const T farthest_;  // distance of the surfaces that count
   T nearest_ = std::numeric_limits<T>::max(), second_ = std::numeric_limits<T>::max();
-  NodeTouch<T, D> touch_;
+  NodeTouch<T, D> touch_ = {};
 };
 
 // ---- nodes near several surfaces
