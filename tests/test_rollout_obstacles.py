@@ -141,7 +141,7 @@ def test_paths_in_calls_of_few_steps(monkeypatch, device):
     state, obstacles = blob(device), bodies(3, smooth(3, device))
     step = mpm.Step(unit_box(), mpm.NeoHookean(E=1e4, nu=0.3), boundaries=obstacles)
     expected, calls, whole = one_by_one(step, state, 17, DT), [], fused_op.substeps
-    monkeypatch.setattr(facts, "_path_bytes", lambda *_: 2**26 // 5)
+    monkeypatch.setattr(facts, "path_bytes", lambda *_: 2**26 // 5)
     monkeypatch.setattr(fused_op, "substeps", lambda *a: calls.append(a[2]) or whole(*a))
     assert_equal(mpm.rollout(step, state, 17, DT), expected)
     assert calls == [5, 5, 5, 2]
