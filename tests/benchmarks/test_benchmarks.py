@@ -306,8 +306,8 @@ def test_svd_program(tmp_path: Path) -> None:
 
 
 def test_memory_of_checkpoints_is_what_was_estimated() -> None:
-    """Memory of live tensors, counted separately; the excess is the working memory of one step's backward pass."""
-    cases = {name: checkpoints.case("torch code", name, 4, 20, "cpu") for name in ("all steps", "5 states")}
-    one_step = cases["all steps"]["estimated_memory"] / 20
-    for case in cases.values():
-        assert 0.9 * case["estimated_memory"] < case["memory"] < case["estimated_memory"] + 4 * one_step
+    """Memory of live tensors, counted separately. The estimate of the working memory is an upper bound, two recorded
+    steps and three states."""
+    for name in ("all steps", "5 states"):
+        case = checkpoints.case("torch code", name, 4, 20, "cpu")
+        assert 0.6 * case["estimated_memory"] < case["memory"] <= case["estimated_memory"]
