@@ -61,7 +61,7 @@ def check(step, state, kept, n=N):
 
 
 def quick(*cases):
-    """Cases of which the first is quick."""
+    """Parameters of the cases. The first case is in the quick suite."""
     first, *others = cases
     return [first, *(pytest.param(case, marks=pytest.mark.thorough) for case in others)]
 
@@ -133,7 +133,7 @@ def test_obstacles_on_paths(kept):
 @pytest.mark.parametrize("share", [2, 4])
 @pytest.mark.parametrize("kind", ["one op", "heat"])
 def test_a_budget_is_kept(kind, share, hooked):
-    """Also where a hook reads states on the way, each of which is stored."""
+    """A hook reads states on the way, and each of these is stored."""
     step, state = heat_scenes.scene(2, torch.float32, per_cell=4)
     if kind == "one op":
         step, state = without_heat(step, state)

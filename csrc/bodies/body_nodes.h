@@ -65,15 +65,14 @@ template <class T, int D>
 struct LoneContact {
   const LoneNode<T, D>& node;
   const ObstaclePose<T, D>& pose;
-  Vector<double, D> at, position;  // where impulses act, and where velocities are read [m]
-  Vector<T, D> u;                  // velocity relative to the surface
+  Vector<double, D> at;  // where impulses act [m]
+  Vector<T, D> u;        // velocity relative to the surface
 
   MPM_HD LoneContact(const ContactArguments<T, D>& a, const ObstaclePose<T, D>* poses, const LoneNode<T, D>& node)
       : node(node), pose(poses[node.obstacle]), at(place_of(a, node.lattice)) {
     Vector<T, D> x;
     MPM_UNROLL for (int i = 0; i < D; i++)
       x[i] = T(at[i]);
-    position = as_double(x);
     u = node.velocity + T(-1) * velocity_at(pose, x);
   }
 

@@ -397,15 +397,13 @@ struct RevolvedShape {
     const int corners = o.numbers / 2;
     const bool across = face >= corners;
     const int edge = edge_of(o.data, corners, face);
-    const bool any_meridian =
-        !(around.point[0] > S(0)) && leads_to_tip(o.data + 2 * edge, end_of_edge(o.data, corners, edge));
-    if (any_meridian) around.across = perpendicular(around.axis);
+    const bool tip = leads_to_tip(o.data + 2 * edge, end_of_edge(o.data, corners, edge));
+    if (tip && !(around.point[0] > S(0))) around.across = perpendicular(around.axis);  // any meridian
     Vector<S, 2> plane_normal;
     const S height =
         edge_height(o.data, corners, edge, across ? across_axis(around.point) : around.point, plane_normal, beyond);
     if (across) plane_normal = across_axis(plane_normal);
-    normal =
-        any_meridian ? plane_normal[0] * around.across + plane_normal[1] * around.axis : around.in_space(plane_normal);
+    normal = around.in_space(plane_normal);
     return height;
   }
 };

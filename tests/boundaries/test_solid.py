@@ -568,7 +568,7 @@ def any_outline(random: torch.Generator) -> list[tuple[float, float]]:
 
 
 def test_nodes_in_an_outline_meet_all_its_faces_that_join(device, dim):
-    """Faces of which a node is as deep below the lines, though their edges and corners are farther away."""
+    """A node may be no deeper below the line of a second face, whose edge is farther away."""
     grid = mpm.Grid(0.1, (-2.0,) * dim, (2.0,) * dim)
     blocks = grid.activate(torch.rand(4000, dim, dtype=torch.float64, device=device) * 3 - 1.5)
     random = torch.Generator().manual_seed(3)

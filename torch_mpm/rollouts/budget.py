@@ -28,8 +28,8 @@ the caches of a CPU; on CUDA enough that the kernels hide the time of Python."""
 def within_budget(steps: Steps, state: State, fused: bool, lengths: Sequence[int] = ()) -> Checkpoints | None:
     """Checkpoints of steps that fit into their budget of memory, if they have one; `EVERYTHING` if all steps fit.
 
-    With `lengths` they are those of each of several rollouts of so many of the steps, whose states are stored at the
-    same time; the backward pass recomputes one rollout after another.
+    `lengths` are the numbers of steps of several rollouts one after another. The budget is that of all of them: their
+    states are stored at the same time, and the backward pass recomputes one rollout after another.
     """
     checkpoints = steps.checkpoints
     if checkpoints is None or checkpoints.memory is None or checkpoints is EVERYTHING:

@@ -42,7 +42,7 @@ class Needs(NamedTuple):
     op. Otherwise autograd records steps as they are computed."""
 
     def bytes_of(self, states: int, steps: int) -> int:
-        """Memory of so many stored states while as many steps are recorded [bytes]."""
+        """Memory of a number of stored states, and of the steps that are recorded meanwhile [bytes]."""
         return states * (self.state + steps * self.path) + steps * (self.step + self.path) + self.call
 
 
