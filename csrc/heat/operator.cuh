@@ -123,46 +123,45 @@ struct LaneCounts {
       of_part[part] = (int(of_cell[part * 32 + lane % (32 / S::slices)]) + S::slices - 1 - slice) / S::slices;
   }
 
-  // Leaves the particles of one part. Returns the number of those before it, which are packed first.
-  __device__ int keep(int only) {
-    int before = 0;
-#pragma unroll
-    for (int part = 0; part < S::parts; part++) {
-      if (part < only) before += __reduce_add_sync(~0u, of_part[part]);
-      if (part != only) of_part[part] = 0;
-    }
-    return before;
-  }
 };
 
 // Calls begin(cell, whether there are particles), each(particle) and end(cell) for the cells of an item, a warp's width
-// of them at a time. All lanes take part, with a non-conducting particle where they have none.
-template <class S, class T, int D, class Begin, class Each, class End>
-__device__ void walk_cells(const LaneCounts<S>& counts, const PackedParticle<T, D>* particles, const Begin& begin,
-                           const Each& each, const End& end) {
+// of them at a time. All lanes take part, with a non-conducting particle where they have none. Of several warps that
+// share an item, each processes the rows of the packed order from its number on, every `Warps`-th.
+template <class S, int Warps, class T, int D, class Begin, class Each, class End>
+__device__ void walk_cells(const LaneCounts<S>& counts, const PackedParticle<T, D>* particles, int warp,
+                           const Begin& begin, const Each& each, const End& end) {
   const int lane = lane_index();
   const unsigned before = (1u << lane) - 1;
 #pragma unroll 1
   for (int part = 0; part < S::parts; part++) {
     const int cell = part * 32 + lane % (32 / S::slices);
     const int mine = part == 0 ? counts.of_part[0] : counts.of_part[S::parts - 1];
-    bool has = mine > 0;
+    const PackedParticle<T, D>* const of_next_part = Warps == 1 ? nullptr : particles + __reduce_add_sync(~0u, mine);
+    int row = 0;
+    const auto skip_row = [&] { particles += __popc(__ballot_sync(~0u, mine > row++)); };
+    while (Warps > 1 && row < warp) skip_row();
+    bool has = mine > row;
     unsigned lanes = __ballot_sync(~0u, has);
-    if (!lanes) continue;
     PackedParticle<T, D> next{};
     if (has) next = load_once(particles + __popc(lanes & before));
-    begin(cell, has);
+    if (lanes) begin(cell, has);
+    const bool some = lanes != 0;
 #pragma unroll 1
-    for (int k = 1; lanes; k++) {
+    while (lanes) {
       PackedParticle<T, D> now = next;
       if (!has) now.conductance = T(0);
       particles += __popc(lanes);
-      has = mine > k;
+      row++;
+#pragma unroll
+      for (int other = 1; other < Warps; other++) skip_row();
+      has = mine > row;
       lanes = __ballot_sync(~0u, has);
       if (has) next = load_once(particles + __popc(lanes & before));
       each(now);
     }
-    end(cell);
+    if (some) end(cell);
+    if (Warps > 1) particles = of_next_part;
   }
 }
 
@@ -236,11 +235,11 @@ __device__ void pack_item(const Topology<T, D>& t, const Columns<const T, D>& x,
   __syncwarp();
 }
 
-// Quads of a base block's tile, in rounds of a warp's width: quad r of a lane lies at entry at[r] of the tile, and at
-// node node[r], -1 where there is none.
-template <class S>
+// Quads of a base block's tile, which the threads of one or several warps share: quad r of a thread lies at entry at[r]
+// of the tile, and at node node[r], -1 where there is none.
+template <class S, int Threads = 32>
 struct TileQuads {
-  static constexpr int rows = S::D == 2 ? S::width : S::width * S::width, rounds = (2 * rows + 31) / 32;
+  static constexpr int rows = S::D == 2 ? S::width : S::width * S::width, rounds = (2 * rows + Threads - 1) / Threads;
   int at[rounds], node[rounds];
 
   template <class T, int D>
@@ -250,16 +249,20 @@ struct TileQuads {
     const int slots = lane < 1 << D ? neighbours[lane] : -1;
 #pragma unroll
     for (int r = 0; r < rounds; r++) {
-      const int quad = r * 32 + lane, far = quad % 2, y = quad / 2 % S::width, x = quad / 2 / S::width;
+      const int quad = quad_of(r), far = quad % 2, y = quad / 2 % S::width, x = quad / 2 / S::width;
       const int row[] = {x, y, 0};  // in 2-D, x is 0
       int neighbour = far;
 #pragma unroll
       for (int axis = 0; axis < D - 1; axis++) neighbour |= (row[axis + 3 - D] >= kBlockWidth) << (D - 1 - axis);
       const int block = __shfl_sync(~0u, slots, neighbour % (1 << D));
       at[r] = x * S::plane + y * S::row + far * kBlockWidth;
-      node[r] = block < 0 || quad >= 2 * rows ? -1 : block * kBlockNodes<D> + node_in_block<D>(row + 3 - D);
+      node[r] = block < 0 || !in_tile(r) ? -1 : block * kBlockNodes<D> + node_in_block<D>(row + 3 - D);
     }
   }
+  __device__ static bool in_tile(int r) { return quad_of(r) < 2 * rows; }
+
+ private:
+  __device__ static int quad_of(int r) { return r * Threads + int(threadIdx.x) % Threads; }
 };
 
 template <class S, class F>
@@ -312,11 +315,43 @@ struct StartValues {
   }
 };
 
-// Adds a sum over the packed particles of the items [number, end), which are of one base block, or of one part of it,
-// to the nodes; returns Σ κ V |∇u|², the same in all lanes.
+// Adds the cells of an item to the sums of a tile; u are the values of its nodes. Of several warps that share the item,
+// each has sums of its own. Returns what the particles of this lane add to Σ κ V |∇u|².
+template <HeatSum Sum, class S, int Warps, class T, int D>
+__device__ T sum_cells(const LaneCounts<S>& counts, const PackedParticle<T, D>* particles, int warp, const T* u,
+                       T* sum) {
+  T from[S::nodes], to[S::nodes], power = T(0);
+  walk_cells<S, Warps>(
+      counts, particles, warp,
+      [&](int cell, bool some) {
+        for_support<S>(cell, [&](int k, int i) {
+          if (Sum == HeatSum::product) from[k] = some ? u[i] : T(0);  // u may be NaN away from the particles
+          to[k] = T(0);
+        });
+        if (Sum == HeatSum::product) to_differences<S::Order, D>(from);
+      },
+      [&](const PackedParticle<T, D>& q) {
+        power += add_particle<Sum, S::Order, T, D>(q.f, q.conductance, from, to);
+      },
+      [&](int cell) {
+        if (Sum == HeatSum::product) to_nodes<S::Order, D>(to);
+        // One node of every cell at a time: they differ, so no node is added to concurrently.
+        for_support<S>(cell, [&](int k, int i) {
+          T value = to[k];
+#pragma unroll
+          for (int o = S::slices / 2; o > 0; o /= 2) value += __shfl_xor_sync(~0u, value, o * 32 / S::slices);
+          if (S::slices == 1 || lane_index() < 32 / S::slices) sum[i] += value;
+          __syncwarp();
+        });
+      });
+  return power;
+}
+
+// Adds a sum over the packed particles of the items [number, end), which are of one base block, to the nodes; returns
+// Σ κ V |∇u|², the same in all lanes.
 template <HeatSum Sum, class S, class Values, class T, int D>
 __device__ T sum_items(const Topology<T, D>& t, const PackedItems<T, D>& packed, int number, int end, const Values& u,
-                       T* out, bool in_order, WarpMemory<S>& memory, int part = -1) {
+                       T* out, bool in_order, WarpMemory<S>& memory) {
   auto& m = memory.tile;
   const Item* const items = reinterpret_cast<const Item*>(schedule_of(t).items);
   LaneCounts<S> counts(packed.counts + int64_t(number) * S::cells);
@@ -328,38 +363,15 @@ __device__ T sum_items(const Topology<T, D>& t, const PackedItems<T, D>& packed,
   __syncwarp();
 #pragma unroll
   for (int r = 0; r < quads.rounds; r++) {
-    if (r * 32 + lane_index() >= 2 * quads.rows) continue;
+    if (!quads.in_tile(r)) continue;
     if (Sum == HeatSum::product) store_vec4(m.u + quads.at[r], loaded[r]);
     store_vec4(m.sum + quads.at[r], Vec4<T>{});
   }
   __syncwarp();
-  T from[S::nodes], to[S::nodes], power = T(0);
+  T power = T(0);
 #pragma unroll 1
   while (true) {
-    const int before = part < 0 ? 0 : counts.keep(part);
-    walk_cells<S>(
-        counts, packed.particles + items[number].begin + before,
-        [&](int cell, bool some) {
-          for_support<S>(cell, [&](int k, int i) {
-            if (Sum == HeatSum::product) from[k] = some ? m.u[i] : T(0);  // u may be NaN away from the particles
-            to[k] = T(0);
-          });
-          if (Sum == HeatSum::product) to_differences<S::Order, D>(from);
-        },
-        [&](const PackedParticle<T, D>& q) {
-          power += add_particle<Sum, S::Order, T, D>(q.f, q.conductance, from, to);
-        },
-        [&](int cell) {
-          if (Sum == HeatSum::product) to_nodes<S::Order, D>(to);
-          // One node of every cell at a time: they differ, so no node is added to concurrently.
-          for_support<S>(cell, [&](int k, int i) {
-            T value = to[k];
-#pragma unroll
-            for (int o = S::slices / 2; o > 0; o /= 2) value += __shfl_xor_sync(~0u, value, o * 32 / S::slices);
-            if (S::slices == 1 || lane_index() < 32 / S::slices) m.sum[i] += value;
-            __syncwarp();
-          });
-        });
+    power += sum_cells<Sum, S, 1>(counts, packed.particles + items[number].begin, 0, m.u, m.sum);
     if (++number >= end) break;
     counts = LaneCounts<S>(packed.counts + int64_t(number) * S::cells);
   }

@@ -4,7 +4,7 @@
 
 #include "cuda/base_block.cuh"
 #include "cuda/columns.cuh"
-#include "cuda/launch.cuh"
+#include "cuda/programmatic_launch.cuh"
 #include "heat/cell.h"
 #include "heat/solve.h"
 #include "heat/sums.cuh"
@@ -481,6 +481,7 @@ struct SceneSolver {
 template <int Order, class T, int D>
 __global__ void __launch_bounds__(kSceneThreads<Order, T>)
     scene_kernel(const __grid_constant__ SceneKernel<Order, T, D> kernel) {
+  grid_dependency_sync();
   extern __shared__ __align__(16) unsigned char shared[];
   __shared__ SceneState<D> state;
   const int scene = int(blockIdx.x);
@@ -522,8 +523,8 @@ void solve_scenes(SceneKernel<Order, T, D> kernel, Stream stream) {
   kernel.most_particles = int(std::max<int64_t>(kFewParticles, 2 * t.particles / t.scenes));
   kernel.x = Columns<const T, D>(kernel.a.x);
   kernel.conductance = Columns<const T, 1>(kernel.a.conductance);
-  launch(scene_kernel<Order, T, D>, unsigned(t.scenes), kSceneThreads<Order, T> / together / 32 * 32,
-         kernel.most_nodes * 2 * sizeof(T), stream, kernel);
+  launch_in_chain(scene_kernel<Order, T, D>, unsigned(t.scenes), kSceneThreads<Order, T> / together / 32 * 32,
+                  kernel.most_nodes * 2 * sizeof(T), stream, kernel);
 }
 
 }  // namespace mpm::cuda

@@ -4,14 +4,15 @@
 #include "heat/operator.cuh"
 
 // The simple steps of heat (csrc/heat/solve.h): a thread block packs the particles of an item, unless G2P has done
-// that, and then a warp sums the products H u of an item. Unlike csrc/heat/heat.cu this needs no barriers of the whole
-// grid, and particles may have left their base block since the activation. Those are at the end of the packed particles
-// of their item.
+// that, and then a warp sums the products H u of an item, or of few items a thread block. Unlike csrc/heat/heat.cu this
+// needs no barriers of the whole grid, and particles may have left their base block since the activation. Those are at
+// the end of the packed particles of their item.
 namespace mpm::cuda {
 namespace {
 
 constexpr int kPackThreads = 192, kEachPacked = kItemParticles / kPackThreads;
-constexpr int kProductThreads = 128;
+constexpr int kProductThreads = 128, kProductWarps = kProductThreads / 32;
+constexpr int64_t kFewParticles = 1 << 18;  // whose items are fewer than the warps of a device
 static_assert(kEachPacked * kPackThreads == kItemParticles);
 
 template <int Order, class T, int D>
@@ -21,7 +22,6 @@ struct SimpleKernel {
   PackedItems<T, D> packed;
   Columns<const T, D> x;
   Columns<const T, 1> conductance;
-  int warps_of_item;  // in a product: one, or one for each part of a block
 
   explicit SimpleKernel(const HeatSimpleArguments<T, D>& a)
       : a(a), packed(packed_in(a.solve.workspace, a.solve.topology)), x(a.solve.x), conductance(a.solve.conductance) {}
@@ -209,53 +209,124 @@ __device__ void add_out_of_block(const SimpleKernel<Order, T, D>& k, int first, 
   }
 }
 
+// The values u of a product.
+template <class T, int D, class F>
+__device__ void with_values(const HeatSimpleArguments<T, D>& a, const Directions<T, D>& directions, const F& f) {
+  if (a.step == 0)
+    f(StartValues<T, D>{a.solve});
+  else
+    f(directions);
+}
+
+// Particles of an item that are in their base block, by all lanes of a warp.
+template <class S, class T, int D>
+__device__ int count_in_block(const PackedItems<T, D>& packed, int number) {
+  int count = 0;
+  for (int c = lane_index(); c < S::cells; c += 32) count += packed.counts[int64_t(number) * S::cells + c];
+  return __reduce_add_sync(~0u, count);
+}
+
+// Calls f(number, item, scene, directions) for each item of a scene that takes this step, from number `first` on.
+template <int Order, class T, int D, class F>
+__device__ void for_items_of_step(const SimpleKernel<Order, T, D>& k, int first, int stride, const F& f) {
+  const Topology<T, D>& t = k.topology();
+  if (t.scenes == 1 && simple_steps(k.a.solve, 0) <= k.a.step) return;
+  const int count = k.items();
+  for (int i = first; i < count; i += stride) {
+    const Item item = k.item(i);
+    const int steps = k.steps_of(item);
+    if (steps <= k.a.step) continue;
+    const int scene = scene_of(t, item.block);
+    f(i, item, scene, Directions<T, D>(k.a, scene, steps));
+  }
+}
+
 // As many threads as in csrc/heat/heat.cu.
 template <int Order, class T>
 constexpr int kProductBlocks = Order == 2 && sizeof(T) == 4 ? 5 : 2;
 
+// A warp for each item.
 template <int Order, class T, int D>
 __global__ void __launch_bounds__(kProductThreads, kProductBlocks<Order, T>)
     product_kernel(const __grid_constant__ SimpleKernel<Order, T, D> k) {
   using S = typename SimpleKernel<Order, T, D>::S;
   grid_dependency_sync();
-  __shared__ WarpMemory<S> memory[kProductThreads / 32];
+  __shared__ WarpMemory<S> memory[kProductWarps];
   WarpMemory<S>& own = memory[threadIdx.x / 32];
-  const Topology<T, D>& t = k.topology();
-  constexpr int warps = kProductThreads / 32;
-  if (t.scenes == 1 && simple_steps(k.a.solve, 0) <= k.a.step) return;
-  const int each = k.warps_of_item, count = k.items() * each;
-  for (int n = int(blockIdx.x) * warps + int(threadIdx.x) / 32; n < count; n += gridDim.x * warps) {
-    const int i = n / each, part = n % each;
-    const Item item = k.item(i);
-    const int steps = k.steps_of(item);
-    if (steps <= k.a.step) continue;
-    const int scene = scene_of(t, item.block), only = each > 1 ? part : -1;
-    const Directions<T, D> directions(k.a, scene, steps);
-    if (k.a.step == 0)
-      sum_items<HeatSum::product, S>(t, k.packed, i, i + 1, StartValues<T, D>{k.a.solve}, k.product(), false, own,
-                                     only);
-    else
-      sum_items<HeatSum::product, S>(t, k.packed, i, i + 1, directions, k.product(), false, own, only);
-    int in_block = 0;
-    for (int c = lane_index(); c < S::cells; c += 32) in_block += k.packed.counts[int64_t(i) * S::cells + c];
-    in_block = __reduce_add_sync(~0u, in_block);
-    add_out_of_block(k, item.begin + in_block + part, item.end, each, scene, directions);
-    __syncwarp();
+  const int warp = int(blockIdx.x) * kProductWarps + int(threadIdx.x) / 32;
+  for_items_of_step(k, warp, gridDim.x * kProductWarps,
+                    [&](int i, const Item& item, int scene, const Directions<T, D>& directions) {
+                      with_values(k.a, directions, [&](const auto& u) {
+                        sum_items<HeatSum::product, S>(k.topology(), k.packed, i, i + 1, u, k.product(), false, own);
+                      });
+                      const int first = item.begin + count_in_block<S>(k.packed, i);
+                      add_out_of_block(k, first, item.end, 1, scene, directions);
+                      __syncwarp();
+                    });
+}
+
+// Adds the tile of each warp to the nodes.
+template <class S, class T>
+__device__ void add_tiles(const TileQuads<S, kProductThreads>& quads, const T (&sums)[kProductWarps][S::tile], T* out) {
+#pragma unroll
+  for (int r = 0; r < quads.rounds; r++) {
+    if (quads.node[r] < 0) continue;
+    Vec4<T> sum{};
+#pragma unroll
+    for (int warp = 0; warp < kProductWarps; warp++) {
+      const Vec4<T> one = load_vec4(sums[warp] + quads.at[r]);
+#pragma unroll
+      for (int e = 0; e < 4; e++) sum.e[e] += one.e[e];
+    }
+    if (sum.e[0] != T(0) || sum.e[1] != T(0) || sum.e[2] != T(0) || sum.e[3] != T(0)) add_quad(out + quads.node[r], sum);
   }
+}
+
+// A thread block for each item: its warps share the nodes, and the particles of each cell.
+template <int Order, class T, int D>
+__global__ void __launch_bounds__(kProductThreads, 2)
+    product_of_few_kernel(const __grid_constant__ SimpleKernel<Order, T, D> k) {
+  using S = typename SimpleKernel<Order, T, D>::S;
+  grid_dependency_sync();
+  __shared__ alignas(16) T values[S::tile];
+  __shared__ alignas(16) T sums[kProductWarps][S::tile];
+  const int warp = int(threadIdx.x) / 32;
+  for_items_of_step(
+      k, int(blockIdx.x), int(gridDim.x), [&](int i, const Item& item, int scene, const Directions<T, D>& directions) {
+        const LaneCounts<S> counts(k.packed.counts + int64_t(i) * S::cells);
+        const TileQuads<S, kProductThreads> quads(k.topology(), item.slot);
+        for (int n = lane_index(); n < S::tile / 4; n += 32) store_vec4(sums[warp] + 4 * n, Vec4<T>{});
+        with_values(k.a, directions, [&](const auto& u) {
+#pragma unroll
+          for (int r = 0; r < quads.rounds; r++)
+            if (quads.in_tile(r))
+              store_vec4(values + quads.at[r], quads.node[r] < 0 ? Vec4<T>{} : u.at(quads.node[r]));
+        });
+        __syncthreads();
+        sum_cells<HeatSum::product, S, kProductWarps>(counts, k.packed.particles + item.begin, warp, values,
+                                                      sums[warp]);
+        const int first = item.begin + count_in_block<S>(k.packed, i);
+        add_out_of_block(k, first + warp, item.end, kProductWarps, scene, directions);
+        __syncthreads();
+        add_tiles<S>(quads, sums, k.product());
+        __syncthreads();
+      });
 }
 
 }  // namespace
 
 template <int Order, class T, int D>
 void heat_simple_step(const HeatSimpleArguments<T, D>& a, Stream stream) {
-  constexpr int64_t few = 1 << 18;  // particles whose items are fewer than the warps of a device
-  SimpleKernel<Order, T, D> kernel(a);
-  kernel.warps_of_item = a.solve.topology.particles < few ? HeatShape<Order, T, D>::parts : 1;
+  const SimpleKernel<Order, T, D> kernel(a);
   const int64_t items = most_items(a.solve.topology.max_blocks, a.solve.topology.particles);
   if (items == 0) return;
   if (!a.packed) launch_in_chain(pack_kernel<Order, T, D>, grid_size(items), kPackThreads, 0, stream, kernel);
-  launch_in_chain(product_kernel<Order, T, D>, grid_size(items * kernel.warps_of_item / (kProductThreads / 32) + 1),
-                  kProductThreads, 0, stream, kernel);
+  const bool few = a.solve.topology.particles < kFewParticles;
+  // Most scenes need no third step, and then each thread block costs time.
+  const int64_t most = a.step < 2 ? items : int64_t(device_attribute(cudaDevAttrMultiProcessorCount)) * 8;
+  const unsigned blocks = grid_size(std::min(few ? items : items / kProductWarps + 1, most));
+  launch_in_chain(few ? product_of_few_kernel<Order, T, D> : product_kernel<Order, T, D>, blocks, kProductThreads, 0,
+                  stream, kernel);
 }
 
 MPM_INSTANTIATE_ORDERS(heat_simple_step, HeatSimpleArguments)
