@@ -27,16 +27,20 @@ struct BodyNode {
   MetSurfaces<T, D> met;   // faces of obstacles come first, at most D
 };
 
-// Impulses on the faces of a node. What walls give beside obstacles counts as that of the first face.
+// The bodies that a node meets, and its impulses on them. The faces of a body have one velocity at a node, so they count
+// together. What walls give beside obstacles counts as that of the first face.
 template <class T, int D>
 struct NodePush {
-  int faces = 0;
-  int obstacle[D];
+  int bodies = 0;
+  int body[D];
+  unsigned numbers = 0;            // of the bodies of the surfaces, two bits each
   Vector<double, D> at, position;  // [m]
-  T impulse[D][D];                 // by face and axis [N s]
+  double impulse[D][D];            // by body and axis [N s]
+
+  MPM_HD int number_of(int surface) const { return int(numbers >> 2 * surface & 3); }
 };
 
-// Derivatives of the impulses [face][axis] of a node by the velocity of one of its faces along one axis.
+// Derivatives of the impulses [body][axis] of a node by the velocity of one of its bodies along one axis.
 template <class T, int D>
 struct PushSlope {
   T of[D][D];
@@ -143,13 +147,19 @@ MPM_HD void set_surface_velocities(const ObstaclePose<T, D>* poses, BodyNode<T, 
     if (c.e[i].owner >= 0) c.e[i].velocity = velocity_at(poses[c.e[i].owner], node.position);
 }
 
-// Sets the faces of obstacles that a node meets, and where it is.
+// Sets the bodies that a node meets, the owners of its obstacles, and where it is.
 template <class T, int D>
-MPM_HD void set_faces(const ContactArguments<T, D>& a, const BodyNode<T, D>& node, NodePush<T, D>& push) {
+MPM_HD void set_bodies(const ContactArguments<T, D>& a, const int* owner, const BodyNode<T, D>& node,
+                       NodePush<T, D>& push) {
   const Constraints<T, D>& c = node.met.constraints;
-  push.faces = 0;
+  push.bodies = 0, push.numbers = 0;
   MPM_LOOP for (int i = 0; i < c.count; i++) {
-    if (c.e[i].owner >= 0) push.obstacle[push.faces++] = c.e[i].owner;
+    if (c.e[i].owner < 0) continue;
+    const int k = owner[c.e[i].owner];
+    int number = 0;
+    MPM_LOOP while (number < push.bodies && push.body[number] != k) number++;
+    if (number == push.bodies) push.body[push.bodies++] = k;
+    push.numbers |= unsigned(number) << 2 * i;
   }
   push.at = place_of(a, node.lattice);
   push.position = as_double(node.position);
@@ -164,13 +174,13 @@ MPM_HD_CALL void take_from_node(bool wanted, const BodyNode<T, D>& node, const V
 
 // Sets the impulses of a node by its mass.
 template <class T, int D>
-MPM_HD void set_impulses(const BodyNode<T, D>& node, const T& mass, const TakenVelocities<T, D>& taken,
-                         NodePush<T, D>& push) {
+MPM_HD void set_impulses(const T& mass, const TakenVelocities<T, D>& taken, NodePush<T, D>& push) {
+  MPM_UNROLL for (int k = 0; k < D; k++) MPM_UNROLL
+    for (int axis = 0; axis < D; axis++) push.impulse[k][axis] = 0;
   MPM_LOOP for (int i = 0; i < taken.count; i++) {
-    const bool is_wall = node.met.constraints.e[i].owner < 0;
-    T(&impulse)[D] = push.impulse[is_wall ? 0 : i];
+    double(&impulse)[D] = push.impulse[push.number_of(i)];
     MPM_UNROLL for (int axis = 0; axis < D; axis++)
-      impulse[axis] = (is_wall ? impulse[axis] : T(0)) + mass * taken.taken[i][axis];
+      impulse[axis] += double(mass * taken.taken[i][axis]);
   }
 }
 
@@ -182,29 +192,29 @@ MPM_HD Vector<T, D> without(const TakenVelocities<T, D>& taken, Vector<T, D> v) 
   return v;
 }
 
-// Sets the derivatives of the impulses of a node by the velocity of a face along an axis, by dual numbers.
+// Sets the derivatives of the impulses of a node by the velocity of a body along an axis, by dual numbers.
 template <class T, int D>
-MPM_HD_CALL void set_slopes(bool wanted, const BodyNode<T, D>& node, const T& mass, const Vector<T, D>& v, int by_face,
-                            int by_axis, PushSlope<T, D>& slope) {
+MPM_HD_CALL void set_slopes(bool wanted, const BodyNode<T, D>& node, const T& mass, const Vector<T, D>& v,
+                            const NodePush<T, D>& push, int by, int by_axis, PushSlope<T, D>& slope) {
   if (!wanted) return;
   using S = Dual<T>;
   const Constraints<T, D>& c = node.met.constraints;
   Constraints<S, D> lifted;
   MPM_LOOP for (int i = 0; i < c.count; i++) {
     add_constant(c.e[i], lifted);
+    const bool moves = c.e[i].owner >= 0 && push.number_of(i) == by;
     MPM_UNROLL for (int axis = 0; axis < D; axis++)
-      if (i == by_face && axis == by_axis) lifted.e[i].velocity[axis].derivative = T(1);
+      if (moves && axis == by_axis) lifted.e[i].velocity[axis].derivative = T(1);
   }
   Vector<S, D> before, change[Constraints<S, D>::most];
   MPM_UNROLL for (int axis = 0; axis < D; axis++)
     before[axis] = lift<S>(node.met.sign[axis] * v[axis]);
   changes_of_constraints<S, D>(lifted, before, change);
+  slope = {};
   MPM_LOOP for (int i = 0; i < c.count; i++) {
-    const bool is_wall = c.e[i].owner < 0;
-    MPM_UNROLL for (int axis = 0; axis < D; axis++) {
-      T& own = slope.of[is_wall ? 0 : i][axis];
-      own = (is_wall ? own : T(0)) - mass * node.met.sign[axis] * change[i][axis].derivative;
-    }
+    T(&own)[D] = slope.of[push.number_of(i)];
+    MPM_UNROLL for (int axis = 0; axis < D; axis++)
+      own[axis] -= mass * node.met.sign[axis] * change[i][axis].derivative;
   }
 }
 
@@ -245,13 +255,13 @@ MPM_HD void set_slope_block(const Slope& slope, const Vector<T, D>& at, const Ve
   }
 }
 
-// Of one face of a node, by the velocity of another one along an axis, for `set_slope_block`.
+// Of one body of a node, by the velocity of one of them along an axis, for `set_slope_block`.
 template <class T, int D>
-MPM_HD auto slope_by_axis(const PushSlope<T, D>& slope, int face, int by_axis) {
-  return [&slope, face, by_axis](int axis) {
+MPM_HD auto slope_by_axis(const PushSlope<T, D>& slope, int number, int by_axis) {
+  return [&slope, number, by_axis](int axis) {
     Vector<T, D> row;
     MPM_UNROLL for (int i = 0; i < D; i++)
-      row[i] = i == by_axis ? slope.of[face][axis] : T(0);
+      row[i] = i == by_axis ? slope.of[number][axis] : T(0);
     return row;
   };
 }

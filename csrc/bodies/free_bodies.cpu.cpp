@@ -49,9 +49,9 @@ struct OneThread {
     }
     each_other(scene, [&](const BodyNode<T, D>& node, const T& mass, const Vector<T, D>& v) {
       NodePush<T, D> push{};
-      set_faces(a.contact, node, push);
+      set_bodies(a.contact, a.owner, node, push);
       if (impulses) add_impulses(scene, node, mass, v, push, impulses);
-      for (int by = 0; slopes && by < push.faces; by++)
+      for (int by = 0; slopes && by < push.bodies; by++)
         for (int axis = 0; axis < D; axis++) add_slopes_by(scene, node, mass, v, push, by, axis, slopes);
     });
   }
@@ -90,25 +90,25 @@ struct OneThread {
                     NodePush<T, D>& push, double* sums) const {
     TakenVelocities<T, D> taken;
     take_from_node(true, node, v, taken);
-    set_impulses(node, mass, taken, push);
-    for (int face = 0; face < push.faces; face++) {
-      const int k = a.owner[push.obstacle[face]];
+    set_impulses(mass, taken, push);
+    for (int number = 0; number < push.bodies; number++) {
+      const int k = push.body[number];
       Vector<double, D> impulse;
-      std::copy_n(push.impulse[face], D, impulse.e);
+      std::copy_n(push.impulse[number], D, impulse.e);
       add_impulse(arm_from(scene.now[k], push.at), impulse, sums + k * n);
     }
   }
 
-  // Derivatives of the impulses on all faces by the velocity of one along an axis.
+  // Derivatives of the impulses on all bodies by the velocity of one along an axis.
   template <class Scene>
   void add_slopes_by(const Scene& scene, const BodyNode<T, D>& node, const T& mass, const Vector<T, D>& v,
                      const NodePush<T, D>& push, int by, int axis, double* sums) const {
     PushSlope<T, D> slope;
-    set_slopes(true, node, mass, v, by, axis, slope);
-    const int l = a.owner[push.obstacle[by]];
-    for (int face = 0; face < push.faces; face++) {
-      const int k = a.owner[push.obstacle[face]];
-      add_slopes(slope_by_axis(slope, face, axis), rounded_arm_from<T>(scene.now[k], push.at),
+    set_slopes(true, node, mass, v, push, by, axis, slope);
+    const int l = push.body[by];
+    for (int number = 0; number < push.bodies; number++) {
+      const int k = push.body[number];
+      add_slopes(slope_by_axis(slope, number, axis), rounded_arm_from<T>(scene.now[k], push.at),
                  rounded_arm_from<T>(scene.now[l], push.position), k, l, sums);
     }
   }

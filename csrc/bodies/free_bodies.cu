@@ -410,7 +410,7 @@ struct BlockTeam {
     if (wants_slopes) slopes.add(pair_of(k, k), block);
   }
 
-  // Impulses on the faces of a node.
+  // Impulses of a node on its bodies.
   template <class Sums>
   __device__ void add_impulses(int i, Sums& sums) const {
     const bool wanted = i < count;
@@ -425,23 +425,23 @@ struct BlockTeam {
       join_warp();
     }
     if (wanted) {
-      set_impulses(node, mass, taken, push);
-      set_faces(a.contact, node, push);
+      set_bodies(a.contact, a.owner, node, push);
+      set_impulses(mass, taken, push);
     }
-    MPM_LOOP for (int face = 0; face < D; face++) {
-      const int k = wanted && face < push.faces ? a.owner[push.obstacle[face]] : -1;
+    MPM_LOOP for (int number = 0; any_of_warp(number < push.bodies); number++) {
+      const int k = number < push.bodies ? push.body[number] : -1;
       double along[n];
       if (k >= 0) {
         Vector<double, D> impulse;
 #pragma unroll
-        for (int axis = 0; axis < D; axis++) impulse[axis] = double(push.impulse[face][axis]);
+        for (int axis = 0; axis < D; axis++) impulse[axis] = push.impulse[number][axis];
         set_along_motions(arm_from(memory.now[k], push.at), impulse, along);
       }
       sums.add(k, along);
     }
   }
 
-  // Derivatives of the impulses on the faces of a node by the velocities of its faces along an axis.
+  // Derivatives of the impulses of a node on its bodies by the velocities of these along an axis.
   template <class Sums>
   __device__ void add_slopes(int i, int axis, Sums& sums) const {
     const bool wanted = i < count;
@@ -451,18 +451,17 @@ struct BlockTeam {
     T mass;
     Vector<T, D> v;
     load(wanted, i, node, mass, v);
-    push.faces = 0;
-    if (wanted) set_faces(a.contact, node, push);
-    MPM_LOOP for (int by = 0; any_of_warp(by < push.faces); by++) {
-      const bool acts = by < push.faces;
-      set_slopes(acts, node, mass, v, by, axis, slope);
+    if (wanted) set_bodies(a.contact, a.owner, node, push);
+    MPM_LOOP for (int by = 0; any_of_warp(by < push.bodies); by++) {
+      const bool acts = by < push.bodies;
+      set_slopes(acts, node, mass, v, push, by, axis, slope);
       join_warp();
-      const int l = acts ? a.owner[push.obstacle[by]] : -1;
-      MPM_LOOP for (int face = 0; face < D; face++) {
-        const int k = acts && face < push.faces ? a.owner[push.obstacle[face]] : -1;
+      const int l = acts ? push.body[by] : -1;
+      MPM_LOOP for (int number = 0; any_of_warp(acts && number < push.bodies); number++) {
+        const int k = acts && number < push.bodies ? push.body[number] : -1;
         T block[n * n];
         if (k >= 0)
-          set_slope_block(slope_by_axis(slope, face, axis), rounded_arm_from<T>(memory.now[k], push.at),
+          set_slope_block(slope_by_axis(slope, number, axis), rounded_arm_from<T>(memory.now[k], push.at),
                           rounded_arm_from<T>(memory.now[l], push.position), block);
         sums.add(pair_of(k, l), block);
       }
