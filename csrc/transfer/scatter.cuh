@@ -781,7 +781,9 @@ void launch_scatter(const Source& source, bool deterministic, Stream stream) {
   using S = typename Source::Shape;
   const int64_t items = most_items(source.topology.max_blocks, source.topology.particles);
   if (items == 0) return;
-  const unsigned blocks = grid_size(source, items);
+  // Of a colour most items are skipped, and then each thread block costs time.
+  const unsigned of_colour = unsigned(device_attribute(cudaDevAttrMultiProcessorCount)) * 8;
+  const unsigned blocks = deterministic ? std::min(grid_size(source, items), of_colour) : grid_size(source, items);
   for (int colour = deterministic ? 0 : -1; colour < (deterministic ? 1 << S::D : 0); colour++)
     launch_in_chain(scatter_kernel<Source>, blocks, S::threads, S::shared_bytes, stream, source, colour);
 }
