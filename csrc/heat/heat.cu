@@ -50,15 +50,16 @@ struct HeatWorkspace {
   SceneWorkspace apart;       // of small scenes
   int64_t size;               // in bytes
 
-  HeatWorkspace(const Topology<T, D>& t, void* memory, bool small) : apart{}, size(0) {
-    char* const base = static_cast<char*>(memory);
+  explicit HeatWorkspace(const HeatArguments<T, D>& a) : apart{}, size(0) {
+    const Topology<T, D>& t = a.topology;
+    char* const base = static_cast<char*>(a.workspace);
     const auto take = [&](int64_t bytes) {
       char* p = base + size;
       size += align_workspace(bytes);
       return p;
     };
     const int64_t nodes = t.max_blocks * int64_t(kBlockNodes<D>);
-    packed.lay_out(t, take);
+    packed.lay_out(t, a.deterministic, take);
     T** const all[] = {&v.mass, &v.weight, &v.inverse, &v.r, &v.p, &v.product};
     for (T** vector : all) *vector = reinterpret_cast<T*>(take(nodes * sizeof(T)));
     const int64_t parts = most_thread_blocks(t) + t.scenes;
@@ -72,7 +73,7 @@ struct HeatWorkspace {
     used = reinterpret_cast<int*>(take(sizeof(int)));
     running = reinterpret_cast<int*>(take(sizeof(int)));
     arrived = reinterpret_cast<unsigned*>(take(sizeof(unsigned)));
-    if (!small) return;
+    if (!small_scenes(t)) return;
     apart.order = reinterpret_cast<int*>(take(t.particles * sizeof(int)));
     apart.cells = reinterpret_cast<SceneCell*>(take((t.particles + t.scenes) * sizeof(SceneCell)));
     apart.left = reinterpret_cast<bool*>(take(t.scenes));
@@ -103,8 +104,7 @@ struct HeatKernel {
   Columns<const T, D> x;
   Columns<const T, 1> conductance;
 
-  HeatKernel(const HeatArguments<T, D>& a, bool small)
-      : a(a), w(a.topology, a.workspace, small), x(a.x), conductance(a.conductance) {}
+  explicit HeatKernel(const HeatArguments<T, D>& a) : a(a), w(a), x(a.x), conductance(a.conductance) {}
 
   // Whether the scene is solved here, and not by a single thread block, nor by other kernels.
   __device__ bool takes(int scene) const {
@@ -435,9 +435,8 @@ __global__ void __launch_bounds__(kHeatThreads<Order, T>, 1) heat_kernel(const H
 template <int Order, class T, int D>
 void heat_cg(const HeatArguments<T, D>& a, Stream stream) {
   const Topology<T, D>& t = a.topology;
-  const bool small = small_scenes(t);
-  HeatKernel<Order, T, D> kernel(a, small);
-  if (small) solve_scenes<Order, T, D>({a, kernel.w.packed.particles, kernel.w.v, kernel.w.apart}, stream);
+  HeatKernel<Order, T, D> kernel(a);
+  if (small_scenes(t)) solve_scenes<Order, T, D>({a, kernel.w.packed.particles, kernel.w.v, kernel.w.apart}, stream);
   constexpr int threads = kHeatThreads<Order, T>,
                 shared_memory = threads / 32 * sizeof(WarpMemory<HeatShape<Order, T, D>>);
   const auto function = heat_kernel<Order, T, D>;
@@ -452,7 +451,7 @@ void heat_cg(const HeatArguments<T, D>& a, Stream stream) {
 
 template <class T, int D>
 int64_t heat_workspace(const HeatArguments<T, D>& a) {
-  return HeatWorkspace<T, D>(a.topology, nullptr, small_scenes(a.topology)).size;
+  return HeatWorkspace<T, D>(a).size;
 }
 MPM_INSTANTIATE_SIZE(heat_workspace, HeatArguments)
 MPM_INSTANTIATE_ORDERS(heat_cg, HeatArguments)

@@ -39,7 +39,7 @@ struct HeatAdvance {
 
   explicit HeatAdvance(const HeatAdvanceArguments<T, D>& a)
       : motion(a.advance), heat(a.to_nodes), rest(a.rest), volume_next(a.volume_next), packs(a.workspace != nullptr) {
-    if (packs) packed = packed_in(a.workspace, a.to_nodes.topology);
+    if (packs) packed = packed_in(a.workspace, a.to_nodes.topology, false);
   }
 
   __device__ Loaded load(int p, int scene) const { return {motion.load(p, scene), heat.read(p, scene), rest.at(p)}; }

@@ -11,7 +11,7 @@ template <class T, int D>
 PackedItems<T, D> lay_out(const Topology<T, D>& t, void* memory, int64_t& size) {
   PackedItems<T, D> packed;
   size = 0;
-  packed.lay_out(t, [&](int64_t bytes) {
+  packed.lay_out(t, false, [&](int64_t bytes) {
     char* p = static_cast<char*>(memory) + size;
     size += align_workspace(bytes);
     return p;

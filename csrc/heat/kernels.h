@@ -26,7 +26,6 @@ MPM_BACKEND_KERNELS(MPM_HEAT_KERNELS)
   PLAIN(heat_layers, HeatLayersArguments)               \
   PLAIN(heat_from_surface, HeatFromSurfaceArguments)    \
   PLAIN(heat_increments, HeatIncrementsArguments)       \
-  PLAIN(heat_count, HeatCountArguments)                 \
   ORDERED(heat_to_particles, HeatToParticlesArguments)
 MPM_BACKEND_KERNELS(MPM_HEAT_TRANSFER_KERNELS)
 

@@ -94,11 +94,6 @@ void heat_increments(const HeatIncrementsArguments<T, D>& a, Stream stream) {
 }
 
 template <class T, int D>
-void heat_count(const HeatCountArguments<T, D>& a, Stream stream) {
-  for_each<count_solve<T, D>>(a.scenes, a, stream);
-}
-
-template <class T, int D>
 void heat_hold(const HeatHoldArguments<T, D>& a, Stream stream) {
   for_each<hold<T, D>>(nodes_of(a.topology), a, stream);
 }
@@ -121,7 +116,6 @@ void heat_add_term(const HeatTermArguments<T, D>& a, Stream stream) {
 MPM_INSTANTIATE(heat_volumes, HeatVolumesArguments)
 MPM_INSTANTIATE(heat_means, HeatMeansArguments)
 MPM_INSTANTIATE(heat_increments, HeatIncrementsArguments)
-MPM_INSTANTIATE(heat_count, HeatCountArguments)
 MPM_INSTANTIATE(heat_finish, HeatFinishArguments)
 MPM_INSTANTIATE(heat_hold, HeatHoldArguments)
 MPM_INSTANTIATE(heat_layers, HeatLayersArguments)

@@ -71,22 +71,25 @@ template <class T, int D>
 struct PackedItems {
   PackedParticle<T, D>* particles;  // [P]
   uint16_t* counts;                 // [items, cells] particles of each cell
+  T* tiles;                         // [slots, kTile] sums of base blocks, where these have an order
+  static constexpr int kTile = HeatShape<3, T, D>::tile;  // that of quadratic weights is smaller
 
   // In a work space, where take(bytes) returns memory.
   template <class Take>
-  void lay_out(const Topology<T, D>& t, const Take& take) {
+  void lay_out(const Topology<T, D>& t, bool has_tiles, const Take& take) {
     const int64_t items = most_items(t.max_blocks, t.particles);
     particles = reinterpret_cast<PackedParticle<T, D>*>(take(t.particles * sizeof(PackedParticle<T, D>)));
     counts = reinterpret_cast<uint16_t*>(take(items * kBlockNodes<D> * sizeof(uint16_t)));
+    tiles = reinterpret_cast<T*>(take(has_tiles ? int64_t(t.max_blocks) * kTile * sizeof(T) : 0));
   }
 };
 
 // Those of the simple steps come first in the work space of a solve, as in csrc/heat/heat.cu.
 template <class T, int D>
-PackedItems<T, D> packed_in(void* workspace, const Topology<T, D>& t) {
+PackedItems<T, D> packed_in(void* workspace, const Topology<T, D>& t, bool has_tiles) {
   PackedItems<T, D> packed;
   char* next = static_cast<char*>(workspace);
-  packed.lay_out(t, [&](int64_t bytes) { return std::exchange(next, next + align_workspace(bytes)); });
+  packed.lay_out(t, has_tiles, [&](int64_t bytes) { return std::exchange(next, next + align_workspace(bytes)); });
   return packed;
 }
 

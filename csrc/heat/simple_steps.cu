@@ -7,6 +7,10 @@
 // that, and then a warp sums the products H u of an item, or of few items a thread block. Unlike csrc/heat/heat.cu this
 // needs no barriers of the whole grid, and particles may have left their base block since the activation. Those are at
 // the end of the packed particles of their item.
+//
+// Where sums have an order, a warp packs the particles of an item in that of the index, and a thread block stores the
+// sums of a base block in a tile. Then each node adds those of the blocks that reach it. All particles are in their base
+// blocks there.
 namespace mpm::cuda {
 namespace {
 
@@ -24,7 +28,7 @@ struct SimpleKernel {
   Columns<const T, 1> conductance;
 
   explicit SimpleKernel(const HeatSimpleArguments<T, D>& a)
-      : a(a), packed(packed_in(a.solve.workspace, a.solve.topology)), x(a.solve.x), conductance(a.solve.conductance) {}
+      : a(a), packed(packed_in(a.solve.workspace, a.solve.topology, a.solve.deterministic)), x(a.solve.x), conductance(a.solve.conductance) {}
 
   __device__ const Topology<T, D>& topology() const { return a.solve.topology; }
   __device__ Item item(int i) const { return reinterpret_cast<const Item*>(schedule_of(topology()).items)[i]; }
@@ -75,6 +79,19 @@ __global__ void __launch_bounds__(kPackThreads) pack_kernel(const __grid_constan
         store_packed(k.packed, m, item.begin, item.end, cell[n], rank[n], q[n], [&] { return particle[n]; });
     __syncthreads();
   }
+}
+
+// The same with the particles of a cell in the order of the index.
+template <int Order, class T, int D>
+__global__ void __launch_bounds__(kProductThreads) pack_in_order_kernel(const __grid_constant__
+                                                                            SimpleKernel<Order, T, D> k) {
+  using S = typename SimpleKernel<Order, T, D>::S;
+  grid_dependency_sync();
+  __shared__ WarpMemory<S> memory[kProductWarps];
+  const int count = k.items(), warp = int(threadIdx.x) / 32;
+  for (int i = int(blockIdx.x) * kProductWarps + warp; i < count; i += int(gridDim.x) * kProductWarps)
+    if (k.steps_of(k.item(i)) > 0)
+      pack_item<S>(k.topology(), k.x, k.conductance, k.item(i), i, k.packed, memory[warp]);
 }
 
 // Directions of a step of a scene.
@@ -265,27 +282,24 @@ __global__ void __launch_bounds__(kProductThreads, kProductBlocks<Order, T>)
                     });
 }
 
-// Adds the tile of each warp to the nodes.
+// The sums of all warps for a quad of the tile.
 template <class S, class T>
-__device__ void add_tiles(const TileQuads<S, kProductThreads>& quads, const T (&sums)[kProductWarps][S::tile], T* out) {
+__device__ Vec4<T> sum_of_warps(const T (&sums)[kProductWarps][S::tile], int at) {
+  Vec4<T> sum{};
 #pragma unroll
-  for (int r = 0; r < quads.rounds; r++) {
-    if (quads.node[r] < 0) continue;
-    Vec4<T> sum{};
+  for (int warp = 0; warp < kProductWarps; warp++) {
+    const Vec4<T> one = load_vec4(sums[warp] + at);
 #pragma unroll
-    for (int warp = 0; warp < kProductWarps; warp++) {
-      const Vec4<T> one = load_vec4(sums[warp] + quads.at[r]);
-#pragma unroll
-      for (int e = 0; e < 4; e++) sum.e[e] += one.e[e];
-    }
-    if (sum.e[0] != T(0) || sum.e[1] != T(0) || sum.e[2] != T(0) || sum.e[3] != T(0)) add_quad(out + quads.node[r], sum);
+    for (int e = 0; e < 4; e++) sum.e[e] += one.e[e];
   }
+  return sum;
 }
 
-// A thread block for each item: its warps share the nodes, and the particles of each cell.
-template <int Order, class T, int D>
+// A thread block for each item: its warps share the nodes, and the particles of each cell. `InOrder`: for each base
+// block, with all of its items.
+template <bool InOrder, int Order, class T, int D>
 __global__ void __launch_bounds__(kProductThreads, 2)
-    product_of_few_kernel(const __grid_constant__ SimpleKernel<Order, T, D> k) {
+    product_by_blocks_kernel(const __grid_constant__ SimpleKernel<Order, T, D> k) {
   using S = typename SimpleKernel<Order, T, D>::S;
   grid_dependency_sync();
   __shared__ alignas(16) T values[S::tile];
@@ -293,7 +307,7 @@ __global__ void __launch_bounds__(kProductThreads, 2)
   const int warp = int(threadIdx.x) / 32;
   for_items_of_step(
       k, int(blockIdx.x), int(gridDim.x), [&](int i, const Item& item, int scene, const Directions<T, D>& directions) {
-        const LaneCounts<S> counts(k.packed.counts + int64_t(i) * S::cells);
+        if (InOrder && item.begin != k.topology().offsets[item.slot]) return;
         const TileQuads<S, kProductThreads> quads(k.topology(), item.slot);
         for (int n = lane_index(); n < S::tile / 4; n += 32) store_vec4(sums[warp] + 4 * n, Vec4<T>{});
         with_values(k.a, directions, [&](const auto& u) {
@@ -303,14 +317,81 @@ __global__ void __launch_bounds__(kProductThreads, 2)
               store_vec4(values + quads.at[r], quads.node[r] < 0 ? Vec4<T>{} : u.at(quads.node[r]));
         });
         __syncthreads();
-        sum_cells<HeatSum::product, S, kProductWarps>(counts, k.packed.particles + item.begin, warp, values,
-                                                      sums[warp]);
-        const int first = item.begin + count_in_block<S>(k.packed, i);
-        add_out_of_block(k, first + warp, item.end, kProductWarps, scene, directions);
+        const int end = InOrder ? k.topology().offsets[item.slot + 1] : item.end;
+        for (int number = i, begin = item.begin; begin < end; begin = k.item(number++).end)
+          sum_cells<HeatSum::product, S, kProductWarps>(LaneCounts<S>(k.packed.counts + int64_t(number) * S::cells),
+                                                        k.packed.particles + begin, warp, values, sums[warp]);
+        if (!InOrder)
+          add_out_of_block(k, item.begin + count_in_block<S>(k.packed, i) + warp, item.end, kProductWarps, scene,
+                           directions);
         __syncthreads();
-        add_tiles<S>(quads, sums, k.product());
+#pragma unroll
+        for (int r = 0; r < quads.rounds; r++) {
+          if (!quads.in_tile(r) || (!InOrder && quads.node[r] < 0)) continue;
+          const Vec4<T> sum = sum_of_warps<S>(sums, quads.at[r]);
+          if (InOrder)
+            store_vec4(k.packed.tiles + int64_t(item.slot) * k.packed.kTile + quads.at[r], sum);
+          else if (sum.e[0] != T(0) || sum.e[1] != T(0) || sum.e[2] != T(0) || sum.e[3] != T(0))
+            add_quad(k.product() + quads.node[r], sum);
+        }
         __syncthreads();
       });
+}
+
+// The product at four nodes of a row of a block from the tiles of the base blocks that reach it.
+template <int Order, class T, int D>
+__device__ Vec4<T> sum_of_tiles(const SimpleKernel<Order, T, D>& k, int scene, const int (&block)[D],
+                                const int (&node)[D]) {
+  using S = typename SimpleKernel<Order, T, D>::S;
+  const Topology<T, D>& t = k.topology();
+  Vec4<T> sum{};
+#pragma unroll
+  for (int o = 0; o < 1 << D; o++) {
+    int base[D], at[D];
+    bool reaches = true;
+#pragma unroll
+    for (int axis = 0; axis < D; axis++) {
+      const int before = o >> (D - 1 - axis) & 1;
+      base[axis] = block[axis] - before;
+      at[axis] = node[axis] + before * kBlockWidth;
+      reaches = reaches && base[axis] >= 0 && (axis == D - 1 || at[axis] < S::width);
+    }
+    const int slot = reaches ? t.table[block_index(t.geometry, scene, base)] : -1;
+    if (slot < 0 || t.offsets[slot + 1] == t.offsets[slot]) continue;
+    const int in_tile = (D == 2 ? 0 : at[0] * S::plane) + at[D - 2] * S::row + at[D - 1];
+    const Vec4<T> one = load_vec4(k.packed.tiles + int64_t(slot) * k.packed.kTile + in_tile);
+#pragma unroll
+    for (int e = 0; e < 4; e++) sum.e[e] += one.e[e];
+  }
+  return sum;
+}
+
+constexpr int kTileThreads = 256;
+
+// Stores the products of the tiles at the nodes, four to a thread.
+template <int Order, class T, int D>
+__global__ void __launch_bounds__(kTileThreads) add_tiles_kernel(const __grid_constant__ SimpleKernel<Order, T, D> k) {
+  grid_dependency_sync();
+  const Topology<T, D>& t = k.topology();
+  constexpr int quads = kBlockNodes<D> / kBlockWidth;
+  const int i = int(blockIdx.x) * kTileThreads + int(threadIdx.x), slot = i / quads;
+  if (slot >= t.max_blocks || t.block[slot] < 0) return;
+  int block[D], node[D] = {};
+  const int scene = block_coordinates(t.geometry, t.block[slot], block);
+  if (scene >= t.scenes || simple_steps(k.a.solve, scene) <= k.a.step) return;
+#pragma unroll
+  for (int axis = D - 2, rest = i % quads; axis >= 0; axis--, rest /= kBlockWidth) node[axis] = rest % kBlockWidth;
+  store_vec4(k.product() + int64_t(i) * kBlockWidth, sum_of_tiles(k, scene, block, node));
+}
+
+template <int Order, class T, int D>
+void step_in_order(const SimpleKernel<Order, T, D>& kernel, int64_t items, Stream stream) {
+  const unsigned of_warps = grid_size(items / kProductWarps + 1);
+  if (!kernel.a.packed) launch_in_chain(pack_in_order_kernel<Order, T, D>, of_warps, kProductThreads, 0, stream, kernel);
+  launch_in_chain(product_by_blocks_kernel<true, Order, T, D>, grid_size(items), kProductThreads, 0, stream, kernel);
+  const int64_t quads = int64_t(kernel.topology().max_blocks) * (kBlockNodes<D> / kBlockWidth);
+  launch_in_chain(add_tiles_kernel<Order, T, D>, unsigned((quads + kTileThreads - 1) / kTileThreads), kTileThreads, 0,
+                  stream, kernel);
 }
 
 }  // namespace
@@ -320,12 +401,13 @@ void heat_simple_step(const HeatSimpleArguments<T, D>& a, Stream stream) {
   const SimpleKernel<Order, T, D> kernel(a);
   const int64_t items = most_items(a.solve.topology.max_blocks, a.solve.topology.particles);
   if (items == 0) return;
+  if (a.solve.deterministic) return step_in_order(kernel, items, stream);
   if (!a.packed) launch_in_chain(pack_kernel<Order, T, D>, grid_size(items), kPackThreads, 0, stream, kernel);
   const bool few = a.solve.topology.particles < kFewParticles;
   // Most scenes need no third step, and then each thread block costs time.
   const int64_t most = a.step < 2 ? items : int64_t(device_attribute(cudaDevAttrMultiProcessorCount)) * 8;
   const unsigned blocks = grid_size(std::min(few ? items : items / kProductWarps + 1, most));
-  launch_in_chain(few ? product_of_few_kernel<Order, T, D> : product_kernel<Order, T, D>, blocks, kProductThreads, 0,
+  launch_in_chain(few ? product_by_blocks_kernel<false, Order, T, D> : product_kernel<Order, T, D>, blocks, kProductThreads, 0,
                   stream, kernel);
 }
 

@@ -67,11 +67,6 @@ void heat_increments(const HeatIncrementsArguments<T, D>& a) {
   });
 }
 
-template <class T, int D>
-void heat_count(const HeatCountArguments<T, D>& a) {
-  for (int64_t scene = 0; scene < a.scenes; scene++) count_solve(a, scene);
-}
-
 template <int Order, class T, int D>
 void heat_to_particles(const HeatToParticlesArguments<T, D>& a) {
   using P = Lanes<T>;
@@ -101,7 +96,6 @@ MPM_INSTANTIATE(heat_volumes, HeatVolumesArguments)
 MPM_INSTANTIATE_ORDERS(heat_to_nodes, HeatToNodesArguments)
 MPM_INSTANTIATE_ORDERS(heat_surface, HeatSurfaceArguments)
 MPM_INSTANTIATE(heat_means, HeatMeansArguments)
-MPM_INSTANTIATE(heat_count, HeatCountArguments)
 MPM_INSTANTIATE(heat_increments, HeatIncrementsArguments)
 MPM_INSTANTIATE_ORDERS(heat_to_particles, HeatToParticlesArguments)
 

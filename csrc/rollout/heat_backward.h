@@ -58,7 +58,6 @@ class HeatBackward {
   HeatToParticlesBackwardArguments<T, D> to_particles(const HeatSolution<T, D>& solution, const HeatAdjoints& adjoints);
   void scatter(const HeatToParticlesBackwardArguments<T, D>& up);
   void solve(HeatArguments<T, D> system, const Tensor& status);
-  void solve_by_simple_steps(const HeatArguments<T, D>& system, double* counts);
   void multiply(const HeatArguments<T, D>& system);
   HeatTermBackwardArguments<T, D> term_backward(const HeatSolution<T, D>& solution,
                                                 const HeatTermArguments<T, D>& term) const;
@@ -171,21 +170,12 @@ void HeatBackward<T, D>::solve(HeatArguments<T, D> system, const Tensor& status)
   system.converged = static_cast<bool*>(converged_.data_ptr());
   if (!workspace_.defined()) workspace_ = empty(in_.x, {backend::heat_workspace(system, stream_)}, ScalarType::Byte);
   system.workspace = workspace_.data_ptr();
-  double* const counts = static_cast<double*>(status.data_ptr());
-  if (MPM_BACKEND == MPM_BACKEND_IS_cpu || !system.deterministic) return solve_by_simple_steps(system, counts);
-  backend::heat_cg(order(), system, stream_);
-  backend::heat_count(HeatCountArguments<T, D>{in_.scenes, system.converged, system.residual, system.scene_dt, counts},
-                      stream_);
-}
-
-template <class T, int D>
-void HeatBackward<T, D>::solve_by_simple_steps(const HeatArguments<T, D>& system, double* counts) {
   backend::clear(products_, stream_);
   HeatFinishArguments<T, D> finish;
   finish.simple.solve = system;
   for (int k = 0; k < kMostSimpleSteps; k++) finish.simple.product[k] = rows(products_) + k * nodes_;
   finish.increment = system.increment;
-  finish.status = counts;
+  finish.status = static_cast<double*>(status.data_ptr());
   solve_simply(order(), finish, stream_);
 }
 

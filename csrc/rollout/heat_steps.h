@@ -122,8 +122,6 @@ class HeatSteps {
     HeatArguments<T, D> a = equations(x, stream);
     if (known)
       use_increments(a, known, stream);
-    else if (takes_simple_steps())
-      solve_by_simple_steps(a, stream);
     else
       solve(a, stream);
     return {down, a, averages()};
@@ -181,12 +179,10 @@ class HeatSteps {
   // The gradient is the last tensor of `heat`.
   bool has_gradient() const { return in_.heat.size() % 3 == 1; }
   bool exchanges() const { return holds_surface() || has_terms(); }
-  // Whether scenes of few simple steps have kernels of their own. Sums on deterministic grids have an order.
-  bool takes_simple_steps() const { return MPM_BACKEND == MPM_BACKEND_IS_cpu || !in_.lattice.deterministic(); }
   // Whether the solve reads the sums of the nodes. Boundaries and the adjoint need averages in arrays.
-  bool solves_for_sums() const { return takes_simple_steps() && !for_record_ && !exchanges() && held_nodes() == 0; }
+  bool solves_for_sums() const { return !for_record_ && !exchanges() && held_nodes() == 0; }
   // Whether G2P packs the particles for the simple steps; a held surface changes their conductance after it.
-  bool packs_in_g2p() const { return takes_simple_steps() && !holds_surface(); }
+  bool packs_in_g2p() const { return !holds_surface(); }
   const T* averages() const { return theta_.defined() ? static_cast<const T*>(theta_.data_ptr()) : nullptr; }
   double* rows_of_status() const { return static_cast<double*>(status.data_ptr()); }
   const T* held_temperature(int64_t k) const { return temperatures_.pointer + k * temperatures_.stride[0]; }
@@ -220,7 +216,6 @@ class HeatSteps {
   HeatArguments<T, D> equations(const Field<const T>& x, backend::Stream stream);
   void solve(HeatArguments<T, D>& a, backend::Stream stream);
   void use_increments(const HeatArguments<T, D>& a, const T* increments, backend::Stream stream);
-  void solve_by_simple_steps(HeatArguments<T, D>& a, backend::Stream stream);
 
   Substeps<T, D>& s_;
   const SubstepsInputs& in_;
@@ -460,8 +455,7 @@ int64_t HeatSteps<T, D>::lay_out_cleared(T* memory, int64_t nodes) {
   sums_ = take(nodes * kHeatChannels);
   if (exchanges()) exchange_ = take(nodes), source_ = take(nodes);
   if (has_terms()) surface_ = take(nodes * kHeatChannels);
-  if (takes_simple_steps())
-    for (T*& product : product_) product = take(nodes);
+  for (T*& product : product_) product = take(nodes);
   return size;
 }
 
@@ -632,17 +626,9 @@ template <class T, int D>
 void* HeatSteps<T, D>::workspace(backend::Stream stream) {
   HeatArguments<T, D> a;
   a.topology = s_.p2g.topology;
+  a.deterministic = in_.lattice.deterministic();
   if (!workspace_.defined()) workspace_ = empty(in_.x, {backend::heat_workspace(a, stream)}, ScalarType::Byte);
   return workspace_.data_ptr();
-}
-
-// Solves the equations of all scenes, and adds the solves to the status.
-template <class T, int D>
-void HeatSteps<T, D>::solve(HeatArguments<T, D>& a, backend::Stream stream) {
-  backend::heat_cg(in_.lattice.order(), a, stream);
-  use_increments(a, a.increment, stream);
-  backend::heat_count(
-      HeatCountArguments<T, D>{in_.scenes, a.converged, a.residual, s_.p2g.scene_dt.pointer, rows_of_status()}, stream);
 }
 
 // Uses the increments of a solve.
@@ -653,11 +639,11 @@ void HeatSteps<T, D>::use_increments(const HeatArguments<T, D>& a, const T* incr
                            stream);
 }
 
-// Solves the equations where scenes of simple steps have kernels of their own. These allow particles that have left
-// their base blocks. On CUDA the solver of the other scenes does not, so an activation is requested where a scene may
-// soon be one.
+// Solves the equations of all scenes, and adds the solves to the status. The kernels of simple steps allow particles
+// that have left their base blocks. On CUDA the solver of the other scenes does not, so an activation is requested where
+// a scene may soon be one.
 template <class T, int D>
-void HeatSteps<T, D>::solve_by_simple_steps(HeatArguments<T, D>& a, backend::Stream stream) {
+void HeatSteps<T, D>::solve(HeatArguments<T, D>& a, backend::Stream stream) {
   HeatFinishArguments<T, D> finish;
   finish.simple.solve = a;
   finish.simple.packed = s_.with_heat.workspace != nullptr;
