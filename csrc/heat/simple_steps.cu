@@ -389,7 +389,7 @@ void step_in_order(const SimpleKernel<Order, T, D>& kernel, int64_t items, Strea
   const unsigned of_warps = grid_size(items / kProductWarps + 1);
   if (!kernel.a.packed) launch_in_chain(pack_in_order_kernel<Order, T, D>, of_warps, kProductThreads, 0, stream, kernel);
   launch_in_chain(product_by_blocks_kernel<true, Order, T, D>, grid_size(items), kProductThreads, 0, stream, kernel);
-  const int64_t quads = int64_t(kernel.topology().max_blocks) * (kBlockNodes<D> / kBlockWidth);
+  const int64_t quads = int64_t(kernel.a.solve.topology.max_blocks) * (kBlockNodes<D> / kBlockWidth);
   launch_in_chain(add_tiles_kernel<Order, T, D>, unsigned((quads + kTileThreads - 1) / kTileThreads), kTileThreads, 0,
                   stream, kernel);
 }
