@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..geometry.values import to_device
 from ..grid.grid import Grid
 from ..grid.topology import Status
 from ..laws import Mixture
@@ -174,8 +175,8 @@ def _deformation(built: Built, state: State, name: str) -> Tensor:
         other = state.J.clamp_min(0).pow(1 / dim)[:, None, None] * eye
     if value is None or state.material is None:
         return other
-    has = torch.tensor([name in part.state_fields for part in laws], device=state.x.device)[state.material.long()]
-    return torch.where(has.reshape(-1, *(1,) * (value.dim() - 1)), value, other)
+    has = to_device(torch.tensor([name in part.state_fields for part in laws], device="cpu"), state.x.device)
+    return torch.where(has[state.material.long()].reshape(-1, *(1,) * (value.dim() - 1)), value, other)
 
 
 # ---- number of blocks

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ..cuda_graphs.capture import DeviceConstantCache
+from ..geometry.values import to_device
 from .compiled import CompiledLaw
 from .material import Material
 from .parameters import Overlay, Table
@@ -59,7 +60,7 @@ def is_thermal(law: Material) -> bool:
 
 Tables = list[tuple[int, Tensor]]
 """Numbers of parameters, `EXPANSION` or `COHERENCY`, with knots and values [2, K] in the dtype and on the device of the
-particles, made without waiting for it."""
+particles."""
 
 
 def tables_of_expansion(law: ThermalExpansion, x: Tensor) -> Tables | None:
@@ -87,12 +88,15 @@ def table_of_coherency(law: Melting, x: Tensor) -> Tables:
 
 
 def _table_of_rows(what: int, rows: Sequence[Tensor], x: Tensor) -> Tables:
-    return [(what, torch.stack([row.to(x) for row in rows]))]
+    return [(what, torch.stack([to_device(row, x.device, x.dtype) for row in rows]))]
 
 
 def _table_of_number(what: int, number: Any, x: Tensor) -> Tables:
     """The table of a number, which a kernel writes: a copy from the host would wait for the device."""
-    value = number.to(x).reshape(1) if isinstance(number, Tensor) else x.new_full((1,), float(number))
+    if isinstance(number, Tensor):
+        value = to_device(number, x.device, x.dtype).reshape(1)
+    else:
+        value = x.new_full((1,), float(number))
     return [(what, torch.stack([x.new_zeros(1), value]))]
 
 
