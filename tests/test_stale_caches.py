@@ -76,6 +76,16 @@ def table(value: Any) -> tuple[mpm.Step, nn.Module]:
     return mpm.Step(GRID, mpm.NeoHookean(E=values, nu=0.3), (0.0, -100.0), "separate"), values
 
 
+def heated(make: Callable[[Any], mpm.Material], owner: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """A law that reads the temperature, in a step with heat."""
+
+    def step(value: Any) -> tuple[mpm.Step, nn.Module]:
+        law = make(value)
+        return mpm.Step(GRID, law, (0.0, -100.0), "separate", heat=mpm.Heat(GRID, 1.0, 1.0)), owner(law)
+
+    return step
+
+
 def sampled(value: Any) -> tuple[mpm.Step, nn.Module]:
     shape = shapes.Sampled.of(shapes.Sphere(0.15), (-0.3, -0.3), (0.3, 0.3), 0.1)
     shape.values = value
@@ -135,6 +145,21 @@ KEPT = {
         of_law(lambda v: mpm.WeaklyCompressible(bulk_modulus=v)), "bulk_modulus", 1e5, 1e3, NO_NUMBERS
     ),
     "table": Kept(table, "value", [1e5, 2e5], [1e3, 2e3], NO_NUMBERS),
+    "expansion": Kept(
+        heated(lambda v: mpm.ThermalExpansion(mpm.NeoHookean(E=1e5, nu=0.3), v), lambda law: law),
+        "coefficient", 0.0, 0.1, NO_NUMBERS,
+    ),
+    "table of an expansion": Kept(
+        heated(
+            lambda v: mpm.ThermalExpansion(mpm.NeoHookean(E=1e5, nu=0.3), mpm.Table([0.0, 10.0], v)),
+            lambda law: law.coefficient,
+        ),
+        "value", [0.0, 0.1], [0.1, 0.0], NO_NUMBERS,
+    ),
+    "table with heat": Kept(
+        heated(lambda v: mpm.NeoHookean(E=mpm.Table([0.0, 10.0], v), nu=0.3), lambda law: law.E),
+        "value", [1e5, 2e5], [1e3, 2e3], NO_NUMBERS,
+    ),
     "gravity": Kept(gravity, "gravity", [0.0, -9.8], [9.0, 3.0]),
     "held velocity": Kept(hold, "velocity", [1.0, 0.0], [0.0, 2.0]),
 }  # fmt: skip

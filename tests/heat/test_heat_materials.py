@@ -55,7 +55,7 @@ def test_an_expansion_by_a_table_follows_the_particles():
     """Values may be assigned on another device than that of the temperatures; meta stands for it."""
     table, x = mpm.Table(KNOTS, VALUES), torch.empty(5, 3, device="meta")
     table.value = torch.empty(3, device="meta")
-    ((_, rows),) = tables_of_expansion(table, x)
+    ((_, rows),) = tables_of_expansion(mpm.ThermalExpansion(mpm.NeoHookean(1e5, 0.3), table), x)
     assert rows.device == x.device and rows.shape == (2, 3)
 
 

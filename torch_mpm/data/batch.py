@@ -10,6 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..geometry.values import to_device
+from ..grid.grid import Grid
 from ..grid.topology import Status
 from ..laws import Mixture
 from ..rollouts import rollout
@@ -17,6 +19,7 @@ from ..scene import fields, heap
 from ..scene.build import Built
 from ..state.state import State, _take_all
 from .frame_transfer import Array, FrameTransfer, StoredFrames
+from .host_copies import Copier, Copies
 
 LOOK = 8
 """Frames between two checks of the stability limit and the validity of the particles, and between two reorderings."""
@@ -104,25 +107,30 @@ def simulate(
         transfer = FrameTransfer(frames, particles_of(built), shapes, built.state.x.device, executor, packed, behind)
         try:
             reports = _run(built, transfer, names, frames, interval, count, on_frame)
-            stored = transfer.finish()
+            stored = [] if reports is None else transfer.finish()
         except BaseException:
             transfer.abandon()
             raise
-        if _had_room(built):
+        if reports is not None:
             return stored, _failures(built, reports, interval / count, frames)
+        transfer.abandon()
 
 
 def _run(
     built: Built, transfer: FrameTransfer, names: Sequence[str], frames: int, interval: float, count: int,
     on_frame: OnFrame | None,
-) -> Tensor:  # fmt: skip
-    """Queue all frames; returns the results of reports, float64 [reports, 3, B] on the device."""
+) -> Tensor | None:  # fmt: skip
+    """Queue all frames; returns the results of reports, float64 [reports, 3, B] on the device. None where particles
+    were without nodes; the pool of blocks is larger then."""
     step, state, reports = built.step, step_ready(built), []
+    pool = _PoolWatch(built.grid) if _grows_late(built) else None
     order = torch.argsort(state.ids)  # type: ignore[arg-type]
     for frame in range(frames):
         if frame:
             state = rollout(step, state, count, interval / count).replace(time=frame * interval)
         if frame % LOOK == 0 or frame == frames - 1:
+            if pool is not None and not pool.look(step.status):
+                return None
             state = step.sorted(state)
             order = torch.argsort(state.ids)  # type: ignore[arg-type]
             reports.append(torch.stack(step.stability_report(state)))
@@ -132,6 +140,8 @@ def _run(
         transfer.put(dict(zip(names, taken, strict=True)))
         if on_frame is not None:
             on_frame(frame)
+    if pool is not None and not pool.finish():
+        return None
     return torch.stack(reports)
 
 
@@ -165,29 +175,61 @@ def _deformation(built: Built, state: State, name: str) -> Tensor:
         other = state.J.clamp_min(0).pow(1 / dim)[:, None, None] * eye
     if value is None or state.material is None:
         return other
-    has = torch.tensor([name in part.state_fields for part in laws], device=state.x.device)[state.material.long()]
-    return torch.where(has.reshape(-1, *(1,) * (value.dim() - 1)), value, other)
+    has = to_device(torch.tensor([name in part.state_fields for part in laws], device="cpu"), state.x.device)
+    return torch.where(has[state.material.long()].reshape(-1, *(1,) * (value.dim() - 1)), value, other)
 
 
 # ---- number of blocks
 
 
+def _grows_late(built: Built) -> bool:
+    """Whether the pool of blocks follows the scene with a delay, in which particles may be without nodes."""
+    return built.grid.grows and built.state.x.is_cuda
+
+
 def _leave_room(built: Built) -> None:
     """Number of blocks for bodies that disintegrate, so that the device need not be queried during the simulation."""
-    if built.grid.grows and built.state.x.is_cuda:
+    if _grows_late(built):
         built.grid.follow(2 * built.grid.pool(built.state.x, built.state.scene))
 
 
-def _had_room(built: Built) -> bool:
-    """Whether all particles had nodes in all steps; otherwise the pool is enlarged."""
-    grid, status = built.grid, built.step.status
-    if status is None or grid.max_blocks is None or not grid.grows:
-        return True
-    wanted = int(status[0, Status.BLOCKS_WANTED])
-    if wanted <= grid.max_blocks:
-        return True
-    grid.follow(wanted)
-    return False
+class _PoolWatch:
+    """Looks at the pool of blocks of a grid, which grows ahead of the scene there.
+
+    A look reads the status of the previous one, whose copy has arrived by then, so that the device has work meanwhile.
+    """
+
+    def __init__(self, grid: Grid) -> None:
+        self._grid, self._copier = grid, Copier()
+        self._least = grid.max_blocks
+        """Smallest pool since the latest look."""
+        self._pending: tuple[Copies, int | None] | None = None
+
+    def look(self, status: Tensor | None) -> bool:
+        """Whether all particles had nodes until the previous look.
+
+        Args:
+            status: that of the step now; None before the first step.
+        """
+        enough = self.finish()
+        if status is not None:
+            self._pending = self._copier.begin({"all": status[0].clone()}), self._least
+        self._least = self._grid.max_blocks
+        return enough
+
+    def finish(self) -> bool:
+        """Whether all particles had nodes until the latest look; otherwise the pool is enlarged. It also grows where
+        more than half of it is in use."""
+        if self._pending is None:
+            return True
+        (copies, least), self._pending = self._pending, None
+        assert least is not None
+        row = copies.arrays()["all"].tolist()
+        wanted = row[Status.BLOCKS_WANTED]
+        # The pool may have grown in time, or that of a call was larger: no activation has a problem then.
+        enough = wanted <= least or row[Status.PROBLEM_ACTIVATION] < 0
+        self._grid.follow(2 * (row[Status.BLOCKS_NOW] if enough else wanted))
+        return enough
 
 
 # ---- failures

@@ -11,7 +11,7 @@ from .compiled import CompiledLaw
 from .material import Material
 from .mixture import Mixture
 from .parameters import Overlay
-from .thermal_calls import COHERENCY, is_thermal, phases_of, tables_of_expansion, tables_of_parameters
+from .thermal_calls import is_thermal, phases_of, table_of_coherency, tables_of_expansion, tables_of_parameters
 
 
 class LawCalls(NamedTuple):
@@ -90,20 +90,22 @@ def _add_phases(calls: LawCalls, law: Material, state: Any, dt: float | Tensor |
     """Add the laws of a material that reads the temperature, and their tables."""
     phases = phases_of(law)
     solid: CompiledLaw = phases.solid  # type: ignore[assignment]
-    liquid: CompiledLaw | None = phases.liquid  # type: ignore[assignment]
+    melting, x = phases.melting, state.x
 
     def add_tables(found: list[tuple[int, Tensor]] | None) -> None:
         assert found is not None
         for what, table in found:
             calls.thermal.extend((len(calls.options) - 1, what, len(calls.tables)))
-            calls.tables.append(table.to(state.x).contiguous())
+            calls.tables.append(table)
 
     name = _add(calls, solid, state, dt)
-    add_tables(tables_of_parameters(solid, state.x))
-    add_tables(tables_of_expansion(phases.expansion, state.x))
+    add_tables(tables_of_parameters(solid, x))
+    if phases.expanding is not None:
+        add_tables(tables_of_expansion(phases.expanding, x))
     calls.history_names.append(solid.history_names())
-    if liquid is not None:
+    if melting is not None:
+        liquid: CompiledLaw = melting.liquid  # type: ignore[assignment]
         name += f"~{_add(calls, liquid, state, dt)}"
-        add_tables(tables_of_parameters(liquid, state.x))
-        add_tables([(COHERENCY, state.x.new_tensor([[0.0], [phases.coherency]]))])
+        add_tables(tables_of_parameters(liquid, x))
+        add_tables(table_of_coherency(melting, x))
     calls.names.append(name)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from ..cuda_graphs.capture import DeviceConstantCache
 from ..errors import check_number
 from ..ops.pointwise import pointwise
 from .compiled import check_value
@@ -45,6 +46,7 @@ class ThermalExpansion(Material):
         self.law = law = as_law("law", law)
         self.state_fields, self.extra_fields = law.state_fields, law.extra_fields
         self.viscous = law.viscous
+        self._kept_table = DeviceConstantCache()
         store(self, "coefficient", check_value("coefficient", coefficient, "finite", lambda v: v == v))
 
     def check_parameters(self, particles: int, scenes: int | None) -> None:
@@ -132,6 +134,7 @@ class Melting(Material):
         self.solid, self.liquid, self.coherency = solid, liquid, float(coherency)
         self.extra_fields = solid.extra_fields
         self.viscous = solid.viscous or liquid.viscous
+        self._kept_table = DeviceConstantCache()
 
     def check_parameters(self, particles: int, scenes: int | None) -> None:
         for law in (self.solid, self.liquid):

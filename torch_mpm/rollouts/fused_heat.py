@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ..boundaries.damping import split_damping
+from ..geometry.values import to_device
 from ..heat.boundaries import (
     STEFAN_BOLTZMANN,
     Convection,
@@ -119,10 +120,10 @@ def _of_scenes(value: Any, like: Tensor, scenes: int) -> Tensor:
 
 
 def _like(value: Any, like: Tensor) -> Tensor:
-    """A tensor of the dtype and on the device of another one. A number is written by a kernel: a copy would wait for
-    the device."""
+    """A tensor of the dtype and on the device of another one, which is not waited for. A number is written by a
+    kernel."""
     if isinstance(value, Tensor):
-        return value.to(like)
+        return to_device(value, like.device, like.dtype)
     return torch.full((), float(value), dtype=like.dtype, device=like.device)
 
 
