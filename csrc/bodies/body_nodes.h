@@ -27,8 +27,8 @@ struct BodyNode {
   MetSurfaces<T, D> met;   // faces of obstacles come first, at most D
 };
 
-// The bodies that a node meets, and its impulses on them. The faces of a body have one velocity at a node, so they count
-// together. What walls give beside obstacles counts as that of the first face.
+// The bodies that a node meets, and its impulses on them. The faces of a body have one velocity at a node, so they
+// count together. What walls give beside obstacles counts as that of the first face.
 template <class T, int D>
 struct NodePush {
   int bodies = 0;
@@ -157,7 +157,8 @@ MPM_HD void set_bodies(const ContactArguments<T, D>& a, const int* owner, const 
     if (c.e[i].owner < 0) continue;
     const int k = owner[c.e[i].owner];
     int number = 0;
-    MPM_LOOP while (number < push.bodies && push.body[number] != k) number++;
+    MPM_LOOP while (number < push.bodies && push.body[number] != k)
+      number++;
     if (number == push.bodies) push.body[push.bodies++] = k;
     push.numbers |= unsigned(number) << 2 * i;
   }
@@ -178,7 +179,7 @@ MPM_HD void set_impulses(const T& mass, const TakenVelocities<T, D>& taken, Node
   MPM_UNROLL for (int k = 0; k < D; k++) MPM_UNROLL
     for (int axis = 0; axis < D; axis++) push.impulse[k][axis] = 0;
   MPM_LOOP for (int i = 0; i < taken.count; i++) {
-    double(&impulse)[D] = push.impulse[push.number_of(i)];
+    double (&impulse)[D] = push.impulse[push.number_of(i)];
     MPM_UNROLL for (int axis = 0; axis < D; axis++)
       impulse[axis] += double(mass * taken.taken[i][axis]);
   }

@@ -125,7 +125,6 @@ struct LaneCounts {
     for (int part = 0; part < S::parts; part++)
       of_part[part] = (int(of_cell[part * 32 + lane % (32 / S::slices)]) + S::slices - 1 - slice) / S::slices;
   }
-
 };
 
 // Calls begin(cell, whether there are particles), each(particle) and end(cell) for the cells of an item, a warp's width
@@ -333,9 +332,7 @@ __device__ T sum_cells(const LaneCounts<S>& counts, const PackedParticle<T, D>* 
         });
         if (Sum == HeatSum::product) to_differences<S::Order, D>(from);
       },
-      [&](const PackedParticle<T, D>& q) {
-        power += add_particle<Sum, S::Order, T, D>(q.f, q.conductance, from, to);
-      },
+      [&](const PackedParticle<T, D>& q) { power += add_particle<Sum, S::Order, T, D>(q.f, q.conductance, from, to); },
       [&](int cell) {
         if (Sum == HeatSum::product) to_nodes<S::Order, D>(to);
         // One node of every cell at a time: they differ, so no node is added to concurrently.

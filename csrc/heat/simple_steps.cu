@@ -9,14 +9,13 @@
 // the end of the packed particles of their item.
 //
 // Where sums have an order, a warp packs the particles of an item in that of the index, and a thread block stores the
-// sums of a base block in a tile. Then each node adds those of the blocks that reach it. All particles are in their base
-// blocks there.
+// sums of a base block in a tile. Then each node adds those of the blocks that reach it. All particles are in their
+// base blocks there.
 namespace mpm::cuda {
 namespace {
 
 constexpr int kPackThreads = 192, kEachPacked = kItemParticles / kPackThreads;
 constexpr int kProductThreads = 128, kProductWarps = kProductThreads / 32;
-constexpr int64_t kFewParticles = 1 << 18;  // whose items are fewer than the warps of a device
 static_assert(kEachPacked * kPackThreads == kItemParticles);
 
 template <int Order, class T, int D>
@@ -28,7 +27,10 @@ struct SimpleKernel {
   Columns<const T, 1> conductance;
 
   explicit SimpleKernel(const HeatSimpleArguments<T, D>& a)
-      : a(a), packed(packed_in(a.solve.workspace, a.solve.topology, a.solve.deterministic)), x(a.solve.x), conductance(a.solve.conductance) {}
+      : a(a),
+        packed(packed_in(a.solve.workspace, a.solve.topology, a.solve.deterministic)),
+        x(a.solve.x),
+        conductance(a.solve.conductance) {}
 
   __device__ const Topology<T, D>& topology() const { return a.solve.topology; }
   __device__ Item item(int i) const { return reinterpret_cast<const Item*>(schedule_of(topology()).items)[i]; }
@@ -83,15 +85,14 @@ __global__ void __launch_bounds__(kPackThreads) pack_kernel(const __grid_constan
 
 // The same with the particles of a cell in the order of the index.
 template <int Order, class T, int D>
-__global__ void __launch_bounds__(kProductThreads) pack_in_order_kernel(const __grid_constant__
-                                                                            SimpleKernel<Order, T, D> k) {
+__global__ void __launch_bounds__(kProductThreads)
+    pack_in_order_kernel(const __grid_constant__ SimpleKernel<Order, T, D> k) {
   using S = typename SimpleKernel<Order, T, D>::S;
   grid_dependency_sync();
   __shared__ WarpMemory<S> memory[kProductWarps];
   const int count = k.items(), warp = int(threadIdx.x) / 32;
   for (int i = int(blockIdx.x) * kProductWarps + warp; i < count; i += int(gridDim.x) * kProductWarps)
-    if (k.steps_of(k.item(i)) > 0)
-      pack_item<S>(k.topology(), k.x, k.conductance, k.item(i), i, k.packed, memory[warp]);
+    if (k.steps_of(k.item(i)) > 0) pack_item<S>(k.topology(), k.x, k.conductance, k.item(i), i, k.packed, memory[warp]);
 }
 
 // Directions of a step of a scene.
@@ -258,36 +259,12 @@ __device__ void for_items_of_step(const SimpleKernel<Order, T, D>& k, int first,
   }
 }
 
-// As many threads as in csrc/heat/heat.cu.
-template <int Order, class T>
-constexpr int kProductBlocks = Order == 2 && sizeof(T) == 4 ? 5 : 2;
-
-// A warp for each item.
-template <int Order, class T, int D>
-__global__ void __launch_bounds__(kProductThreads, kProductBlocks<Order, T>)
-    product_kernel(const __grid_constant__ SimpleKernel<Order, T, D> k) {
-  using S = typename SimpleKernel<Order, T, D>::S;
-  grid_dependency_sync();
-  __shared__ WarpMemory<S> memory[kProductWarps];
-  WarpMemory<S>& own = memory[threadIdx.x / 32];
-  const int warp = int(blockIdx.x) * kProductWarps + int(threadIdx.x) / 32;
-  for_items_of_step(k, warp, gridDim.x * kProductWarps,
-                    [&](int i, const Item& item, int scene, const Directions<T, D>& directions) {
-                      with_values(k.a, directions, [&](const auto& u) {
-                        sum_items<HeatSum::product, S>(k.topology(), k.packed, i, i + 1, u, k.product(), false, own);
-                      });
-                      const int first = item.begin + count_in_block<S>(k.packed, i);
-                      add_out_of_block(k, first, item.end, 1, scene, directions);
-                      __syncwarp();
-                    });
-}
-
-// The sums of all warps for a quad of the tile.
-template <class S, class T>
-__device__ Vec4<T> sum_of_warps(const T (&sums)[kProductWarps][S::tile], int at) {
-  Vec4<T> sum{};
+// The sums of several warps for a quad of the tile.
+template <int Warps, class T, int N>
+__device__ Vec4<T> sum_of_warps(const T (*sums)[N], int at) {
+  Vec4<T> sum = load_vec4(sums[0] + at);
 #pragma unroll
-  for (int warp = 0; warp < kProductWarps; warp++) {
+  for (int warp = 1; warp < Warps; warp++) {
     const Vec4<T> one = load_vec4(sums[warp] + at);
 #pragma unroll
     for (int e = 0; e < 4; e++) sum.e[e] += one.e[e];
@@ -295,46 +272,62 @@ __device__ Vec4<T> sum_of_warps(const T (&sums)[kProductWarps][S::tile], int at)
   return sum;
 }
 
-// A thread block for each item: its warps share the nodes, and the particles of each cell. `InOrder`: for each base
-// block, with all of its items.
-template <bool InOrder, int Order, class T, int D>
-__global__ void __launch_bounds__(kProductThreads, 2)
-    product_by_blocks_kernel(const __grid_constant__ SimpleKernel<Order, T, D> k) {
+template <class T>
+__device__ bool is_zero(const Vec4<T>& v) {
+  return v.e[0] == T(0) && v.e[1] == T(0) && v.e[2] == T(0) && v.e[3] == T(0);
+}
+
+// Least number of thread blocks of a multiprocessor; of many items as many threads as in csrc/heat/heat.cu.
+template <int Warps, int Order, class T>
+constexpr int kProductBlocks = Warps == 1 && Order == 2 && sizeof(T) == 4 ? 5 : 2;
+
+// One or several warps for each item share the nodes, and the particles of each cell. `InOrder`: for each base block,
+// with all of its items.
+template <bool InOrder, int Warps, int Order, class T, int D>
+__global__ void __launch_bounds__(kProductThreads, kProductBlocks<Warps, Order, T>)
+    product_kernel(const __grid_constant__ SimpleKernel<Order, T, D> k) {
   using S = typename SimpleKernel<Order, T, D>::S;
+  using Quads = TileQuads<S, 32 * Warps>;
+  constexpr int together = kProductWarps / Warps;  // items of a thread block
   grid_dependency_sync();
-  __shared__ alignas(16) T values[S::tile];
-  __shared__ alignas(16) T sums[kProductWarps][S::tile];
-  const int warp = int(threadIdx.x) / 32;
+  __shared__ alignas(16) T values_of_items[together][S::tile];
+  __shared__ alignas(16) T sums_of_warps[kProductWarps][S::tile];
+  const int warp = int(threadIdx.x) / 32 % Warps, own = int(threadIdx.x) / 32 / Warps;
+  T* const values = values_of_items[own];
+  T(*const sums)[S::tile] = sums_of_warps + own * Warps;
+  const auto sync = [] { Warps == 1 ? __syncwarp() : __syncthreads(); };
   for_items_of_step(
-      k, int(blockIdx.x), int(gridDim.x), [&](int i, const Item& item, int scene, const Directions<T, D>& directions) {
+      k, int(blockIdx.x) * together + own, int(gridDim.x) * together,
+      [&](int i, const Item& item, int scene, const Directions<T, D>& directions) {
         if (InOrder && item.begin != k.topology().offsets[item.slot]) return;
-        const TileQuads<S, kProductThreads> quads(k.topology(), item.slot);
-        for (int n = lane_index(); n < S::tile / 4; n += 32) store_vec4(sums[warp] + 4 * n, Vec4<T>{});
+        const Quads quads(k.topology(), item.slot);
         with_values(k.a, directions, [&](const auto& u) {
+          Vec4<T> loaded[Quads::rounds];
+#pragma unroll
+          for (int r = 0; r < quads.rounds; r++) loaded[r] = quads.node[r] < 0 ? Vec4<T>{} : u.at(quads.node[r]);
 #pragma unroll
           for (int r = 0; r < quads.rounds; r++)
-            if (quads.in_tile(r))
-              store_vec4(values + quads.at[r], quads.node[r] < 0 ? Vec4<T>{} : u.at(quads.node[r]));
+            if (quads.in_tile(r)) store_vec4(values + quads.at[r], loaded[r]);
         });
-        __syncthreads();
+        for (int n = lane_index(); n < S::tile / 4; n += 32) store_vec4(sums[warp] + 4 * n, Vec4<T>{});
+        sync();
         const int end = InOrder ? k.topology().offsets[item.slot + 1] : item.end;
         for (int number = i, begin = item.begin; begin < end; begin = k.item(number++).end)
-          sum_cells<HeatSum::product, S, kProductWarps>(LaneCounts<S>(k.packed.counts + int64_t(number) * S::cells),
-                                                        k.packed.particles + begin, warp, values, sums[warp]);
-        if (!InOrder)
-          add_out_of_block(k, item.begin + count_in_block<S>(k.packed, i) + warp, item.end, kProductWarps, scene,
-                           directions);
-        __syncthreads();
+          sum_cells<HeatSum::product, S, Warps>(LaneCounts<S>(k.packed.counts + int64_t(number) * S::cells),
+                                                k.packed.particles + begin, warp, values, sums[warp]);
+        sync();
 #pragma unroll
         for (int r = 0; r < quads.rounds; r++) {
           if (!quads.in_tile(r) || (!InOrder && quads.node[r] < 0)) continue;
-          const Vec4<T> sum = sum_of_warps<S>(sums, quads.at[r]);
+          const Vec4<T> sum = sum_of_warps<Warps>(sums, quads.at[r]);
           if (InOrder)
             store_vec4(k.packed.tiles + int64_t(item.slot) * k.packed.kTile + quads.at[r], sum);
-          else if (sum.e[0] != T(0) || sum.e[1] != T(0) || sum.e[2] != T(0) || sum.e[3] != T(0))
+          else if (!is_zero(sum))
             add_quad(k.product() + quads.node[r], sum);
         }
-        __syncthreads();
+        if (!InOrder)
+          add_out_of_block(k, item.begin + count_in_block<S>(k.packed, i) + warp, item.end, Warps, scene, directions);
+        sync();
       });
 }
 
@@ -384,14 +377,14 @@ __global__ void __launch_bounds__(kTileThreads) add_tiles_kernel(const __grid_co
   store_vec4(k.product() + int64_t(i) * kBlockWidth, sum_of_tiles(k, scene, block, node));
 }
 
-template <int Order, class T, int D>
-void step_in_order(const SimpleKernel<Order, T, D>& kernel, int64_t items, Stream stream) {
-  const unsigned of_warps = grid_size(items / kProductWarps + 1);
-  if (!kernel.a.packed) launch_in_chain(pack_in_order_kernel<Order, T, D>, of_warps, kProductThreads, 0, stream, kernel);
-  launch_in_chain(product_by_blocks_kernel<true, Order, T, D>, grid_size(items), kProductThreads, 0, stream, kernel);
-  const int64_t quads = int64_t(kernel.a.solve.topology.max_blocks) * (kBlockNodes<D> / kBlockWidth);
-  launch_in_chain(add_tiles_kernel<Order, T, D>, unsigned((quads + kTileThreads - 1) / kTileThreads), kTileThreads, 0,
-                  stream, kernel);
+template <bool InOrder, int Warps, int Order, class T, int D>
+void multiply(const SimpleKernel<Order, T, D>& kernel, int64_t items, Stream stream) {
+  constexpr int together = kProductWarps / Warps;
+  // Most scenes need no third step, and then each thread block costs time.
+  const int64_t few = int64_t(device_attribute(cudaDevAttrMultiProcessorCount)) * 8;
+  const int64_t blocks = (items + together - 1) / together;
+  launch_in_chain(product_kernel<InOrder, Warps, Order, T, D>,
+                  grid_size(kernel.a.step < 2 ? blocks : std::min(blocks, few)), kProductThreads, 0, stream, kernel);
 }
 
 }  // namespace
@@ -399,16 +392,22 @@ void step_in_order(const SimpleKernel<Order, T, D>& kernel, int64_t items, Strea
 template <int Order, class T, int D>
 void heat_simple_step(const HeatSimpleArguments<T, D>& a, Stream stream) {
   const SimpleKernel<Order, T, D> kernel(a);
-  const int64_t items = most_items(a.solve.topology.max_blocks, a.solve.topology.particles);
+  const Topology<T, D>& t = a.solve.topology;
+  const int64_t items = most_items(t.max_blocks, t.particles);
   if (items == 0) return;
-  if (a.solve.deterministic) return step_in_order(kernel, items, stream);
+  // Of few items, which leave most of a device idle, several warps process one.
+  const bool few = items <= int64_t(device_attribute(cudaDevAttrMultiProcessorCount)) * 16;
+  if (a.solve.deterministic) {
+    const unsigned of_warps = grid_size(items / kProductWarps + 1);
+    if (!a.packed) launch_in_chain(pack_in_order_kernel<Order, T, D>, of_warps, kProductThreads, 0, stream, kernel);
+    few ? multiply<true, kProductWarps>(kernel, items, stream) : multiply<true, 1>(kernel, items, stream);
+    const int64_t quads = int64_t(t.max_blocks) * (kBlockNodes<D> / kBlockWidth);
+    launch_in_chain(add_tiles_kernel<Order, T, D>, unsigned((quads + kTileThreads - 1) / kTileThreads), kTileThreads, 0,
+                    stream, kernel);
+    return;
+  }
   if (!a.packed) launch_in_chain(pack_kernel<Order, T, D>, grid_size(items), kPackThreads, 0, stream, kernel);
-  const bool few = a.solve.topology.particles < kFewParticles;
-  // Most scenes need no third step, and then each thread block costs time.
-  const int64_t most = a.step < 2 ? items : int64_t(device_attribute(cudaDevAttrMultiProcessorCount)) * 8;
-  const unsigned blocks = grid_size(std::min(few ? items : items / kProductWarps + 1, most));
-  launch_in_chain(few ? product_by_blocks_kernel<false, Order, T, D> : product_kernel<Order, T, D>, blocks, kProductThreads, 0,
-                  stream, kernel);
+  few ? multiply<false, kProductWarps>(kernel, items, stream) : multiply<false, 1>(kernel, items, stream);
 }
 
 MPM_INSTANTIATE_ORDERS(heat_simple_step, HeatSimpleArguments)
