@@ -26,6 +26,7 @@ struct NodeField {
   T* pointer = nullptr;
   int64_t stride = 0;  // elements from node to node
   int channels = 0;
+  T* tiles = nullptr;  // memory for sums with an order, on CUDA: see csrc/transfer/tiles.h; may be absent
 };
 
 }  // namespace mpm

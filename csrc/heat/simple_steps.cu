@@ -2,6 +2,7 @@
 #include "cuda/programmatic_launch.cuh"
 #include "heat/kernels.h"
 #include "heat/operator.cuh"
+#include "transfer/tiles.cuh"
 
 // The simple steps of heat (csrc/heat/solve.h): a thread block packs the particles of an item, unless G2P has done
 // that, and then a warp sums the products H u of an item, or of few items a thread block. Unlike csrc/heat/heat.cu this
@@ -331,31 +332,21 @@ __global__ void __launch_bounds__(kProductThreads, kProductBlocks<Warps, Order, 
       });
 }
 
-// The product at four nodes of a row of a block from the tiles of the base blocks that reach it.
+// The product at four nodes of a row of a block from the tiles that have them.
 template <int Order, class T, int D>
 __device__ Vec4<T> sum_of_tiles(const SimpleKernel<Order, T, D>& k, int scene, const int (&block)[D],
                                 const int (&node)[D]) {
   using S = typename SimpleKernel<Order, T, D>::S;
-  const Topology<T, D>& t = k.topology();
   Vec4<T> sum{};
-#pragma unroll
-  for (int o = 0; o < 1 << D; o++) {
-    int base[D], at[D];
-    bool reaches = true;
-#pragma unroll
-    for (int axis = 0; axis < D; axis++) {
-      const int before = o >> (D - 1 - axis) & 1;
-      base[axis] = block[axis] - before;
-      at[axis] = node[axis] + before * kBlockWidth;
-      reaches = reaches && base[axis] >= 0 && (axis == D - 1 || at[axis] < S::width);
-    }
-    const int slot = reaches ? t.table[block_index(t.geometry, scene, base)] : -1;
-    if (slot < 0 || t.offsets[slot + 1] == t.offsets[slot]) continue;
-    const int in_tile = (D == 2 ? 0 : at[0] * S::plane) + at[D - 2] * S::row + at[D - 1];
-    const Vec4<T> one = load_vec4(k.packed.tiles + int64_t(slot) * k.packed.kTile + in_tile);
+  for_base_blocks(k.topology(), scene, block, [&](int slot, int before) {
+    const int row = row_of_tile<S::width>(node, before);
+    if (row < 0) return;
+    const int first = D == 2 ? row * S::row : row / S::width * S::plane + row % S::width * S::row;
+    const int at = first + (before & 1) * kBlockWidth;
+    const Vec4<T> one = load_vec4(k.packed.tiles + int64_t(slot) * k.packed.kTile + at);
 #pragma unroll
     for (int e = 0; e < 4; e++) sum.e[e] += one.e[e];
-  }
+  });
   return sum;
 }
 

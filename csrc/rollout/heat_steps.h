@@ -344,7 +344,7 @@ void HeatSteps<T, D>::add_layers(const Field<const T>& x, const Field<const int>
   down.x = x;
   down.value = field<const T>(exchange_of_particles_);
   down.deterministic = in_.lattice.deterministic();
-  down.nodes = {exchange_, 1, 1};
+  down.nodes = {exchange_, 1, 1, s_.tile_memory()};
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda
   backend::heat_exchange(in_.lattice.order(), down, stream);  // of particles that may have left their base blocks
 #else
@@ -478,7 +478,7 @@ HeatToNodesArguments<T, D> HeatSteps<T, D>::to_nodes(const Field<const T>& x, co
   a.blend = field<T>(blend_);
   a.number = field<T>(number_);
   a.largest = largest_;
-  a.sums = {sums_, kHeatChannels, kHeatChannels};
+  a.sums = {sums_, kHeatChannels, kHeatChannels, s_.tile_memory()};
   return a;
 }
 
@@ -556,7 +556,7 @@ HeatSurfaceArguments<T, D> HeatSteps<T, D>::surface(const Field<const T>& x, con
     a.dt = in_.dt;
   }
   a.deterministic = in_.lattice.deterministic();
-  a.sums = {surface_, kHeatChannels, kHeatChannels};
+  a.sums = {surface_, kHeatChannels, kHeatChannels, s_.tile_memory()};
   return a;
 }
 

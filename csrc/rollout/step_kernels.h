@@ -19,6 +19,7 @@
 #include "rollout/plan.op.h"
 #include "rollout/pool.h"
 #include "transfer/kernels.h"
+#include "transfer/tiles.h"
 
 // Many steps in one call: activation, laws, P2G, grid update, obstacles and G2P in the order of the ops of one step, in
 // buffers that belong to the call. Shared by the ops of rollouts.
@@ -53,6 +54,7 @@ struct Substeps {
   bool obstacles = false, fused = false;
   bool laws_are_apart = false;  // whether laws have kernels of their own: they read temperatures, or heat the particles
   Tensor kept = absent();       // of FLIP, see `keep_velocities`
+  Tensor tiles = absent();      // of sums with an order, see csrc/transfer/tiles.h
   LateDeformation<T, D> late;   // of P2G, if G2P defers F or J to it
   ReorderOnScatter<T, D> reorder;  // of P2G, if the call owns the particles
   bool nodes_are_clear = false;    // when a step begins
@@ -370,6 +372,13 @@ struct Substeps {
     return static_cast<const NodeRow<T, D>*>((pool.velocity.defined() ? pool.velocity : pool.updated).data_ptr());
   }
 
+  // Memory for sums with an order, absent where colours of blocks give it: where the backward pass recomputes the
+  // steps, whose sums have the order of single steps, and without heat.
+  T* tile_memory() const { return tiles.defined() ? static_cast<T*>(tiles.data_ptr()) : nullptr; }
+  bool takes_tiles() const {
+    return MPM_BACKEND != MPM_BACKEND_IS_cpu && p2g.deterministic && in.resident && !in.heat.empty();
+  }
+
   void make_pool(backend::Stream stream);
   void make_known_nodes(backend::Stream stream);
   void use_pool();
@@ -540,6 +549,7 @@ void Substeps<T, D>::make_pool(backend::Stream stream) {
   const bool apart = obstacles && !next.obstacles;  // contact is separate from the grid update
   pool.make(in.x, activation, apart, stream);
   if (obstacles && in.resident && in.n > 1) make_known_nodes(stream);
+  if (takes_tiles()) tiles = empty(in.x, {int64_t(activation.slots()) * tile_words<D>(int(in.lattice.order()))});
   if (largest_mass.defined()) pool.nodes = empty(in.x, Pool<T, D>::nodes_shape(activation), ScalarType::Long);
   if (impulse.defined() && (MPM_BACKEND == MPM_BACKEND_IS_cpu || in.lattice.deterministic()))
     impulse_slots = empty(in.x, {activation.slots(), impulse_shape()[1] * kImpulse<D>}, ScalarType::Double);
@@ -572,7 +582,7 @@ template <class T, int D>
 void Substeps<T, D>::use_pool() {
   const Topology<T, D> topology = topology_of(activation);
   p2g.topology = advance.gather.topology = topology;
-  p2g.nodes = {static_cast<T*>(pool.nodes.data_ptr()), 1 + D, 1 + D};
+  p2g.nodes = {static_cast<T*>(pool.nodes.data_ptr()), 1 + D, 1 + D, tile_memory()};
   update.max_blocks = contact.max_blocks = topology.max_blocks;
   next.near_blocks = activation.max_blocks;
   update.block = contact.block = topology.block;

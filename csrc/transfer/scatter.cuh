@@ -4,6 +4,7 @@
 #include "cuda/programmatic_launch.cuh"
 #include "cuda/vec4.cuh"
 #include "transfer/momentum.cuh"
+#include "transfer/tiles.cuh"
 
 // The kernel of P2G and scatter. One thread block processes the particles of one item, links them by cell in shared
 // memory, and sums nodes in registers: each cell has one thread per leading node of the support, Order + 1 of them,
@@ -637,9 +638,15 @@ __device__ Vec4<T> quad_sum(const T* sums, int (&node)[S::D], int first_word, bo
   return sum;
 }
 
-// Adds the sums of nodes of a round to the grid, four words at a time.
+// Words of a tile of sums with an order: rows of quads, first those of the block and then those of the next one.
+template <class S>
+constexpr int kTileWords = (S::D == 2 ? S::width : S::width * S::width) * S::row_quads * 4;
+
+// Adds the sums of nodes of a round to the grid, four words at a time; or stores them in a tile, where there is one.
+// `adds`: to what it has.
 template <class S, int Round, int D, class Nodes, class T>
-__device__ void flush_tile(const Nodes& nodes, const int slots[1 << D], const T* sums, bool in_order) {
+__device__ void flush_tile(const Nodes& nodes, const int slots[1 << D], const T* sums, bool in_order, T* tile = nullptr,
+                           bool adds = false) {
   constexpr int K = S::channels, width = S::width, lanes = K == 4 ? 1 : 4;
   constexpr int count = (D == 2 ? width : width * width) * S::row_quads * lanes;
   const bool dense = is_dense<S>(nodes);
@@ -652,8 +659,19 @@ __device__ void flush_tile(const Nodes& nodes, const int slots[1 << D], const T*
 #pragma unroll
     for (int i = 0; i < D - 1; i++) neighbour = neighbour * 2 + (node[i] >= kBlockWidth);
     const int slot = t < count ? slots[neighbour * 2 + far] : -1;
-    const Vec4<T> value = quad_sum<S, Round>(sums, in_tile, first_word + far * kBlockWidth * K, slot >= 0);
-    if (slot < 0 || t % lanes != 0) continue;
+    const bool wanted = tile ? t < count : slot >= 0;
+    Vec4<T> value = quad_sum<S, Round>(sums, in_tile, first_word + far * kBlockWidth * K, wanted);
+    if (!wanted || t % lanes != 0) continue;
+    if (tile) {
+      T* const stored = tile + (tile_row * S::row_quads + quad) * 4;
+      if (adds || Round > 0) {
+        const Vec4<T> before = load_vec4(stored);
+#pragma unroll
+        for (int e = 0; e < 4; e++) value.e[e] += before.e[e];
+      }
+      store_vec4(stored, value);
+      continue;
+    }
     if (value.e[0] == T(0) && value.e[1] == T(0) && value.e[2] == T(0) && value.e[3] == T(0)) continue;
     const int64_t row = int64_t(slot) * kBlockNodes<D> + node_in_block<D>(node);
     if (is_fixed(nodes)) {
@@ -671,11 +689,12 @@ __device__ void flush_tile(const Nodes& nodes, const int slots[1 << D], const T*
   }
 }
 
-// Adds the particles in shared memory to the nodes; `add_strays` adds those in no list. `when_added` is called when
-// their memory is no longer needed. All threads have to wait before that memory is reused.
+// Adds the particles in shared memory to the nodes, or to a tile as `flush_tile`; `add_strays` adds those in no list.
+// `when_added` is called when their memory is no longer needed. All threads have to wait before that memory is reused.
 template <class S, class Nodes, class AddOutOfBlock, class WhenAdded>
 __device__ void add_particles(const Nodes& nodes, const SharedParticles<S>& shared, const int* slots, bool in_order,
-                              const AddOutOfBlock& add_out_of_block, const WhenAdded& when_added) {
+                              const AddOutOfBlock& add_out_of_block, const WhenAdded& when_added,
+                              typename S::T* tile = nullptr, bool adds = false) {
   using T = typename S::T;
   T* const sums = reinterpret_cast<T*>(shared.quads);
   const Walker<S> walker;
@@ -691,12 +710,12 @@ __device__ void add_particles(const Nodes& nodes, const SharedParticles<S>& shar
   put_slab<S, 0>(sum, sums);
   when_added();
   __syncthreads();
-  flush_tile<S, 0, S::D>(nodes, slots, sums, in_order);
+  flush_tile<S, 0, S::D>(nodes, slots, sums, in_order, tile, adds);
   if constexpr (S::rounds == 2) {
     __syncthreads();
     put_slab<S, 1>(sum, sums);
     __syncthreads();
-    flush_tile<S, 1, S::D>(nodes, slots, sums, in_order);
+    flush_tile<S, 1, S::D>(nodes, slots, sums, in_order, tile, adds);
   }
 }
 
@@ -714,11 +733,13 @@ struct ScatterMemory {
   OutOfBlockList<Displaced ? S::batch : 1> out_of_block;
 };
 
-// Adds the particles of an item to the nodes; `memory` is dynamic shared memory of S::shared_bytes.
+// Adds the particles of an item to the nodes, or stores them in a tile; `memory` is dynamic shared memory of
+// S::shared_bytes.
 template <class Source>
 __device__ void scatter_item(const Source& source, const Topology<typename Source::Shape::T, Source::Shape::D>& t,
                              const Item& item, bool in_order, char* memory,
-                             ScatterMemory<typename Source::Shape, Source::displaced>& m) {
+                             ScatterMemory<typename Source::Shape, Source::displaced>& m,
+                             typename Source::Shape::T* tile = nullptr) {
   using S = typename Source::Shape;
   using T = typename S::T;
   constexpr int D = S::D;
@@ -728,10 +749,14 @@ __device__ void scatter_item(const Source& source, const Topology<typename Sourc
     load_particles<S>(source, t, item.block, m.base_block, shared, m.out_of_block, begin,
                       min(S::batch, item.end - begin), in_order || is_fixed(source.nodes));
     if (threadIdx.x < 1 << D) m.slots[threadIdx.x] = slot;
-    add_particles(source.nodes, shared, m.slots, in_order, [&] {
-      if constexpr (Source::displaced)
-        add_out_of_block<S>(source, source.nodes, t, schedule_of(t), m.base_block.scene, shared, m.out_of_block, begin);
-    });
+    add_particles(
+        source.nodes, shared, m.slots, in_order,
+        [&] {
+          if constexpr (Source::displaced)
+            add_out_of_block<S>(source, source.nodes, t, schedule_of(t), m.base_block.scene, shared, m.out_of_block,
+                                begin);
+        },
+        [] {}, tile, begin > item.begin);
     __syncthreads();
   }
 }
@@ -740,7 +765,10 @@ __device__ void scatter_item(const Source& source, const Topology<typename Sourc
 // its place in the index, the inputs of a particle; contribution(loaded), its contribution; and optionally is_due(),
 // whether there is work, and skip(p, place) for a particle outside.
 //
-// colour < 0: every item, with atomics. Otherwise the base blocks of that colour, whole, without atomics.
+// Sums in no order: every item, with atomics. Otherwise base blocks, whole: those of a colour without atomics, or all
+// with tiles.
+enum Colour : int { kTiled = -2, kNoOrder = -1 };
+
 template <class Source>
 __global__ void __launch_bounds__(Source::Shape::threads, Source::resident)
     scatter_kernel(const Source source, int colour) {
@@ -754,7 +782,7 @@ __global__ void __launch_bounds__(Source::Shape::threads, Source::resident)
   __shared__ ScatterMemory<S, Source::displaced> shared;
   const Topology<T, D>& t = source.topology;
   const Schedule<const int> schedule = schedule_of(t);
-  const bool in_order = colour >= 0;
+  const bool in_order = colour != kNoOrder;
   const int4* const items = reinterpret_cast<const int4*>(schedule.items);
   const int count = *schedule.item_count;
   int4 entries = items[blockIdx.x];  // without waiting for the count: the space suffices
@@ -763,10 +791,12 @@ __global__ void __launch_bounds__(Source::Shape::threads, Source::resident)
     i += gridDim.x;
     if (i < count) entries = items[i];
     if (in_order) {
-      if (block_colour(t.geometry, item.block) != colour || item.begin != t.offsets[item.slot]) continue;
+      if (colour != kTiled && block_colour(t.geometry, item.block) != colour) continue;
+      if (item.begin != t.offsets[item.slot]) continue;
       item.end = t.offsets[item.slot + 1];
     }
-    scatter_item(source, t, item, in_order, memory, shared);
+    T* const tile = colour == kTiled ? source.nodes.tiles + int64_t(item.slot) * kTileWords<S> : nullptr;
+    scatter_item(source, t, item, in_order, memory, shared, tile);
   }
   if constexpr (requires { source.skip(0, 0); }) {
     const int64_t stride = int64_t(gridDim.x) * S::threads;
@@ -776,16 +806,62 @@ __global__ void __launch_bounds__(Source::Shape::threads, Source::resident)
   }
 }
 
+constexpr int kTileThreads = 256;
+
+// Adds the sums of the tiles to the nodes: a thread for four words of a row of nodes along the last axis.
+template <class S>
+__global__ void __launch_bounds__(kTileThreads)
+    add_tiles_kernel(const Topology<typename S::T, S::D> t, const NodeField<typename S::T> nodes) {
+  using T = typename S::T;
+  constexpr int D = S::D, K = S::channels, rows = kBlockNodes<D> / kBlockWidth;
+  grid_dependency_sync();
+  const int i = int(blockIdx.x) * kTileThreads + int(threadIdx.x), quad = i % K, slot = i / K / rows;
+  if (slot >= t.max_blocks || t.block[slot] < 0) return;
+  int block[D], node[D] = {};
+  const int scene = block_coordinates(t.geometry, t.block[slot], block);
+  if (scene >= t.scenes) return;
+#pragma unroll
+  for (int axis = D - 2, rest = i / K % rows; axis >= 0; axis--, rest /= kBlockWidth) node[axis] = rest % kBlockWidth;
+  Vec4<T> sum{};
+  for_base_blocks(t, scene, block, [&](int from, int before) {
+    const int row = row_of_tile<S::width>(node, before), far = before & 1;
+    if (row < 0 || (far && quad >= S::far_quads)) return;
+    const int at = row * S::row_quads + (far ? S::near_quads : 0) + quad;
+    const Vec4<T> one = load_vec4(nodes.tiles + int64_t(from) * kTileWords<S> + 4 * at);
+#pragma unroll
+    for (int e = 0; e < 4; e++) sum.e[e] += one.e[e];
+  });
+  const int64_t first = int64_t(slot) * kBlockNodes<D> + node_in_block<D>(node);
+#pragma unroll
+  for (int e = 0; e < 4; e++) {
+    const int word = 4 * quad + e;
+    nodes.pointer[(first + word / K) * nodes.stride + word % K] += sum.e[e];
+  }
+}
+
 template <class Source>
 void launch_scatter(const Source& source, bool deterministic, Stream stream) {
   using S = typename Source::Shape;
-  const int64_t items = most_items(source.topology.max_blocks, source.topology.particles);
+  const Topology<typename S::T, S::D>& t = source.topology;
+  const int64_t items = most_items(t.max_blocks, t.particles);
   if (items == 0) return;
+  const unsigned blocks = grid_size(source, items);
+  const auto launch_colour = [&](int colour, unsigned count) {
+    launch_in_chain(scatter_kernel<Source>, count, S::threads, S::shared_bytes, stream, source, colour);
+  };
+  if (!deterministic) return launch_colour(kNoOrder, blocks);
+  if constexpr (S::channels <= kTileChannels) {
+    static_assert(kTileWords<S> <= tile_words<S::D>(S::Order));
+    if (source.nodes.tiles) {
+      launch_colour(kTiled, blocks);
+      const int64_t threads = int64_t(t.max_blocks) * (kBlockNodes<S::D> / kBlockWidth) * S::channels;
+      return launch_in_chain(add_tiles_kernel<S>, unsigned((threads + kTileThreads - 1) / kTileThreads), kTileThreads,
+                             0, stream, t, NodeField<typename S::T>(source.nodes));
+    }
+  }
   // Of a colour most items are skipped, and then each thread block costs time.
-  const unsigned of_colour = unsigned(device_attribute(cudaDevAttrMultiProcessorCount)) * 8;
-  const unsigned blocks = deterministic ? std::min(grid_size(source, items), of_colour) : grid_size(source, items);
-  for (int colour = deterministic ? 0 : -1; colour < (deterministic ? 1 << S::D : 0); colour++)
-    launch_in_chain(scatter_kernel<Source>, blocks, S::threads, S::shared_bytes, stream, source, colour);
+  const unsigned most = unsigned(device_attribute(cudaDevAttrMultiProcessorCount)) * 8;
+  for (int colour = 0; colour < 1 << S::D; colour++) launch_colour(colour, std::min(blocks, most));
 }
 
 enum class Stress { none, moment, gradient };
