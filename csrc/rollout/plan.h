@@ -237,10 +237,12 @@ inline std::string unsupported(const PlanFacts& f) {
 }
 // It pays if one wave of thread blocks suffices for all items. Pools with this property are small, or grow and were
 // given room for all blocks by `pool_for`. On deterministic grids the choice must not depend on the growth of another
-// pool.
+// pool, or of this one.
 inline std::string unprofitable(const PlanFacts& f) {
   if (f.grows && f.max_blocks < 0) return "the size of the pool is not known before the first activation";
   if (f.grows && f.max_blocks != f.blocks()) return "the pool has no room for all blocks of the domain";
+  if (f.grows && f.deterministic && f.blocks() > kFewBlocks)
+    return "the grid is deterministic, and a pool for all blocks of the domain may come from growth alone";
   if (!f.grows && f.max_blocks > kMostPersistentBlocks)
     return "the pool has more than " + count(kMostPersistentBlocks, "blocks");
   const int64_t most = kMostPersistentParticles / (f.grows && !f.deterministic ? 1 : 2);

@@ -103,6 +103,18 @@ def test_particles_leave_their_blocks(dim, scenes, stiff, device):
     compare(step, state.replace(x=x, v=state.v + moving), 40, tolerance=1e-6 if stiff else 1e-9)
 
 
+@pytest.mark.parametrize("deterministic", [False, True])
+@pytest.mark.parametrize("kernel", ["quadratic", "cubic"])
+def test_crowded_blocks(dim, kernel, deterministic, device):
+    """Blocks with more particles than an item of the CUDA kernels has, or a batch of these."""
+    options = {"kernel": kernel, "deterministic": deterministic, "per_cell": 81 if dim == 2 else 27, "device": device}
+    step, state = scene(dim, melts=True, **options)
+    boundaries = [*terms()["convection"]]
+    step = held(step, (heat_boundaries.FixedSurface, bodies(dim)["sphere"], 40.0))
+    step.heat.boundaries = [*step.heat.boundaries.entries, *boundaries]
+    compare(step, state, 10)
+
+
 def test_deterministic_grids_repeat_the_heat(dim, device):
     """To the last bit, also where a CUDA graph repeats the steps."""
     ends = []
@@ -190,14 +202,15 @@ def test_heat_of_a_source_is_its_energy(device):
     assert float(grown) == pytest.approx(2e8 * float(state.volume.sum()) * DT, rel=1e-9)
 
 
+@pytest.mark.parametrize("deterministic", [False, True])
 @pytest.mark.parametrize("bounds", [[4e-7], [8e-4], [2e-2], [4e-7, 8e-4, 2e-2], [8e-4, 2e-2, 4e-7]])
-def test_short_solves_reach_the_tolerance(dim, bounds, device):
+def test_short_solves_reach_the_tolerance(dim, bounds, deterministic, device):
     """Changes of temperature at bounds of the spectrum that need one, two or more steps of the solver, against solves
     with a tolerance near rounding; scenes of a batch need different numbers."""
     changes = []
     for run, tolerance in ((mpm.rollout, 1e-6), (composed, 1e-13)):
         # The hybrid and APIC change more than conduction.
-        step, state = scene(dim, scenes=len(bounds), transfer="flip", device=device)
+        step, state = scene(dim, scenes=len(bounds), transfer="flip", deterministic=deterministic, device=device)
         conductivity = torch.tensor(bounds, dtype=torch.float64) * 1000 * 100 * 0.1**2 / (4 * DT)
         step.heat.specific_heat, step.heat.tolerance = torch.tensor(100.0, dtype=torch.float64), tolerance
         step.heat.conductivity = conductivity if len(bounds) > 1 else float(conductivity)

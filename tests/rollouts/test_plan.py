@@ -170,6 +170,20 @@ def test_order_of_particles(changes, order):
     assert plan_call(None, CUDA._replace(sorted=False, particles=2**15)._replace(**changes)).order == order
 
 
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("scenes", [1, 40])
+@pytest.mark.parametrize("blocks", [64, 4096, 4097, 8000])
+@pytest.mark.parametrize("particles", [400, 5000, 2**14, 2**15, 2**18])
+def test_the_schedule_of_a_deterministic_grid_does_not_depend_on_its_pool(dim, scenes, blocks, particles):
+    """A pool may have grown to all blocks of the domain, and another run of the same steps begins with a small one."""
+    facts = CUDA._replace(
+        dim=dim, deterministic=True, scenes=scenes, scene_ids=scenes > 1, particles=particles, blocks_per_scene=blocks
+    )
+    every = blocks * scenes
+    plans = [plan_call(None, facts._replace(max_blocks=pool)) for pool in (-1, every // 7 + 1, every // 2, every)]
+    assert len({plan.schedule for plan in plans}) == 1
+
+
 @pytest.mark.parametrize(
     ("schedule", "facts", "reason"),
     [
