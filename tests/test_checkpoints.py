@@ -338,13 +338,15 @@ def test_an_estimate_of_a_rollout_in_one_op(device):
     assert mpm.estimate_rollout(step, state, 0, DT).steps == 0
 
 
-@pytest.mark.parametrize("heated", [False, True])
+@pytest.mark.parametrize("heated", ["", "heat", "heat, deterministic"])
 @pytest.mark.parametrize("kept", [None, 8, mpm.Checkpoints(states=3), mpm.Checkpoints(memory=3e8)])
 def test_an_estimate_of_a_rollout_in_one_op_is_what_the_allocator_gives(kept, heated, device):
     """From above, as for small scenes in `test_rollout_memory.py`."""
     if device == "cpu":
         pytest.skip("the allocator of large tensors on the CPU has no counters")
     step, state = study.setup("compiled", 24, device)
+    if "deterministic" in heated:
+        step.grid = mpm.Grid(step.grid.dx, step.grid.lower, step.grid.upper, deterministic=True)
     if heated:
         step.heat = mpm.Heat(step.grid, conductivity=50.0, specific_heat=100.0)
         state = step.prepare(state.replace(temperature=state.x[:, 0].clone()))

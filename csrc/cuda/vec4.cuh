@@ -16,5 +16,10 @@ template <class T>
 __device__ void store_vec4(T* p, const Vec4<T>& q) {
   *reinterpret_cast<Vec4<T>*>(p) = q;
 }
+template <class T>
+__device__ void operator+=(Vec4<T>& a, const Vec4<T>& b) {
+#pragma unroll
+  for (int e = 0; e < 4; e++) a.e[e] += b.e[e];
+}
 
 }  // namespace mpm::cuda

@@ -1,7 +1,6 @@
 #pragma once
 
 #include <limits>
-#include <type_traits>
 
 #include "common/warp.h"
 #include "grid/friction.h"

@@ -207,7 +207,7 @@ MPM_HD void count_solve(const HeatCountArguments<T, D>& a, int64_t scene) {
 template <class T, int D>
 MPM_HD HeatCountArguments<T, D> count_of(const HeatFinishArguments<T, D>& a) {
   const HeatArguments<T, D>& solve = a.simple.solve;
-  return {solve.topology.scenes, solve.converged, solve.residual, solve.scene_dt, a.status};
+  return {solve.converged, solve.residual, solve.scene_dt, a.status};
 }
 
 }  // namespace TORCH_MPM_ISA

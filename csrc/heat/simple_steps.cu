@@ -9,9 +9,9 @@
 // needs no barriers of the whole grid, and particles may have left their base block since the activation. Those are at
 // the end of the packed particles of their item.
 //
-// Where sums have an order, a warp packs the particles of an item in that of the index, and a thread block stores the
-// sums of a base block in a tile. Then each node adds those of the blocks that reach it. All particles are in their
-// base blocks there.
+// Where sums have an order, a warp packs the particles of an item in that of the index, and stores the sums of a base
+// block in a tile (transfer/tiles.h). All particles are in their base blocks there. The order does not depend on the
+// other scenes or the pool: an item has one warp.
 namespace mpm::cuda {
 namespace {
 
@@ -265,11 +265,7 @@ template <int Warps, class T, int N>
 __device__ Vec4<T> sum_of_warps(const T (*sums)[N], int at) {
   Vec4<T> sum = load_vec4(sums[0] + at);
 #pragma unroll
-  for (int warp = 1; warp < Warps; warp++) {
-    const Vec4<T> one = load_vec4(sums[warp] + at);
-#pragma unroll
-    for (int e = 0; e < 4; e++) sum.e[e] += one.e[e];
-  }
+  for (int warp = 1; warp < Warps; warp++) sum += load_vec4(sums[warp] + at);
   return sum;
 }
 
@@ -343,29 +339,20 @@ __device__ Vec4<T> sum_of_tiles(const SimpleKernel<Order, T, D>& k, int scene, c
     if (row < 0) return;
     const int first = D == 2 ? row * S::row : row / S::width * S::plane + row % S::width * S::row;
     const int at = first + (before & 1) * kBlockWidth;
-    const Vec4<T> one = load_vec4(k.packed.tiles + int64_t(slot) * k.packed.kTile + at);
-#pragma unroll
-    for (int e = 0; e < 4; e++) sum.e[e] += one.e[e];
+    sum += load_vec4(k.packed.tiles + int64_t(slot) * k.packed.kTile + at);
   });
   return sum;
 }
 
-constexpr int kTileThreads = 256;
-
-// Stores the products of the tiles at the nodes, four to a thread.
+// Stores the products of the tiles at the nodes, a thread for each row of four.
 template <int Order, class T, int D>
 __global__ void __launch_bounds__(kTileThreads) add_tiles_kernel(const __grid_constant__ SimpleKernel<Order, T, D> k) {
   grid_dependency_sync();
-  const Topology<T, D>& t = k.topology();
-  constexpr int quads = kBlockNodes<D> / kBlockWidth;
-  const int i = int(blockIdx.x) * kTileThreads + int(threadIdx.x), slot = i / quads;
-  if (slot >= t.max_blocks || t.block[slot] < 0) return;
-  int block[D], node[D] = {};
-  const int scene = block_coordinates(t.geometry, t.block[slot], block);
-  if (scene >= t.scenes || simple_steps(k.a.solve, scene) <= k.a.step) return;
-#pragma unroll
-  for (int axis = D - 2, rest = i % quads; axis >= 0; axis--, rest /= kBlockWidth) node[axis] = rest % kBlockWidth;
-  store_vec4(k.product() + int64_t(i) * kBlockWidth, sum_of_tiles(k, scene, block, node));
+  at_row_of_nodes(k.topology(), int(blockIdx.x) * kTileThreads + int(threadIdx.x),
+                  [&](int scene, const int (&block)[D], const int (&node)[D], int64_t first) {
+                    if (simple_steps(k.a.solve, scene) > k.a.step)
+                      store_vec4(k.product() + first, sum_of_tiles(k, scene, block, node));
+                  });
 }
 
 template <bool InOrder, int Warps, int Order, class T, int D>
@@ -386,18 +373,15 @@ void heat_simple_step(const HeatSimpleArguments<T, D>& a, Stream stream) {
   const Topology<T, D>& t = a.solve.topology;
   const int64_t items = most_items(t.max_blocks, t.particles);
   if (items == 0) return;
-  // Of few items, which leave most of a device idle, several warps process one.
-  const bool few = items <= int64_t(device_attribute(cudaDevAttrMultiProcessorCount)) * 16;
   if (a.solve.deterministic) {
     const unsigned of_warps = grid_size(items / kProductWarps + 1);
     if (!a.packed) launch_in_chain(pack_in_order_kernel<Order, T, D>, of_warps, kProductThreads, 0, stream, kernel);
-    few ? multiply<true, kProductWarps>(kernel, items, stream) : multiply<true, 1>(kernel, items, stream);
-    const int64_t quads = int64_t(t.max_blocks) * (kBlockNodes<D> / kBlockWidth);
-    launch_in_chain(add_tiles_kernel<Order, T, D>, unsigned((quads + kTileThreads - 1) / kTileThreads), kTileThreads, 0,
-                    stream, kernel);
-    return;
+    multiply<true, 1>(kernel, items, stream);
+    return launch_in_chain(add_tiles_kernel<Order, T, D>, blocks_for_rows(t, 1), kTileThreads, 0, stream, kernel);
   }
   if (!a.packed) launch_in_chain(pack_kernel<Order, T, D>, grid_size(items), kPackThreads, 0, stream, kernel);
+  // Of few items, which leave most of a device idle, several warps process one.
+  const bool few = items <= int64_t(device_attribute(cudaDevAttrMultiProcessorCount)) * 16;
   few ? multiply<false, kProductWarps>(kernel, items, stream) : multiply<false, 1>(kernel, items, stream);
 }
 

@@ -56,8 +56,8 @@ struct HeatArguments {
   void* workspace = nullptr;  // bytes returned by heat_workspace()
 };
 
-// Products H u of the simple steps, from particles that may have left their base blocks; on CUDA by kernels without
-// barriers of the grid.
+// Products H u of the simple steps, from particles that may have left their base blocks, but where sums have an order;
+// on CUDA by kernels without barriers of the grid.
 template <class T, int D>
 struct HeatSimpleArguments {
   HeatArguments<T, D> solve;       // its increments are those of the other scenes

@@ -206,7 +206,6 @@ struct HeatFinishArguments {
 // Adds the solves of a substep to the status of the scenes.
 template <class T, int D>
 struct HeatCountArguments {
-  int64_t scenes = 0;
   const bool* converged = nullptr;
   const T* residual = nullptr;
   const T* scene_dt = nullptr;  // may be absent

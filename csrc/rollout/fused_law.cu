@@ -204,7 +204,7 @@ template <class Law, int D>
 struct FusedLaunches {
   static void p2g(const LawUpdateArguments<float, D>& law, const LateDeformation<float, D>& late,
                   const P2GArguments<float, D>& a, const ReorderOnScatter<float, D>& reorder, void* stream) {
-    launch_scatter(ReorderingSource<Law, float, D>(a, law, late, reorder), false, static_cast<Stream>(stream));
+    launch_scatter(ReorderingSource<Law, float, D>(a, law, late, reorder), static_cast<Stream>(stream));
   }
   static void g2p2g(const LawUpdateArguments<float, D>& law, const G2P2GArguments<float, D>& a, void* stream) {
     launch_g2p2g(LawMomentumSource<Law, float, D, true>(a.p2g, law, a.late),

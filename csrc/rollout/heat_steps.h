@@ -640,8 +640,8 @@ void HeatSteps<T, D>::use_increments(const HeatArguments<T, D>& a, const T* incr
 }
 
 // Solves the equations of all scenes, and adds the solves to the status. The kernels of simple steps allow particles
-// that have left their base blocks. On CUDA the solver of the other scenes does not, so an activation is requested
-// where a scene may soon be one.
+// that have left their base blocks, but for sums with an order, where none has. On CUDA the solver of the other scenes
+// does not, so an activation is requested where a scene may soon be one.
 template <class T, int D>
 void HeatSteps<T, D>::solve(HeatArguments<T, D>& a, backend::Stream stream) {
   HeatFinishArguments<T, D> finish;

@@ -7,6 +7,7 @@
 #include <type_traits>
 
 #include "bodies/bodies.op.h"
+#include "cuda/schedule.h"
 #include "grid/contact.h"
 #include "grid/impulse.op.h"
 #include "grid/obstacle.op.h"
@@ -130,7 +131,7 @@ struct Substeps {
   GridUpdateArguments<T, D> find_nodes_before(P2GArguments<T, D> particles, T* nodes, NodeRow<T, D>* updated,
                                               backend::Stream stream) const {
     particles.stress = {};
-    particles.nodes = {nodes, 1 + D, 1 + D};
+    particles.nodes = {nodes, 1 + D, 1 + D, particles.nodes.tiles};
     backend::p2g(in.lattice.order(), particles, stream);
     GridUpdateArguments<T, D> a = update;
     a.gravity = nullptr;
@@ -399,6 +400,10 @@ Substeps<T, D>::Substeps(const SubstepsInputs& inputs) : in(inputs) {
   STD_TORCH_CHECK(in.dt > 0 && std::isfinite(in.dt), "dt must be positive and finite, got ", in.dt);
   STD_TORCH_CHECK(in.wants_C || !in.apic, "apic needs wants_C");
   activation = activate_arguments<T, D>(in.lattice, in.x, in.scene, in.ids, in.scenes, in.max_blocks);
+#if MPM_BACKEND == MPM_BACKEND_IS_cuda
+  // So that the items of a scene with heat, and the order of its sums, do not depend on the other scenes.
+  if (in.lattice.deterministic() && !in.heat.empty()) activation.most_of_item = cuda::kItemParticles;
+#endif
   if (has(in.previous_status))
     previous_status = int_pointer(*in.previous_status, "previous_status", in.x, {1 + in.scenes, kStatusSize});
   set_laws();

@@ -52,7 +52,7 @@ struct MotionAdjointSource {
 template <int Order, class T, int D>
 void g2p_advance_backward(const G2PAdvanceBackwardArguments<T, D>& a, Stream stream) {
   const bool moves = a.scatter.moment.pointer && !a.scatter.gradient.pointer && a.scatter.topology.max_blocks > 0;
-  if (moves && !a.scatter.deterministic) return launch_scatter(MotionAdjointSource<Order, T, D>(a), false, stream);
+  if (moves && !a.scatter.deterministic) return launch_scatter(MotionAdjointSource<Order, T, D>(a), stream);
   advance_backward(a.advance, stream);
   scatter<Order>(a.scatter, stream);
 }

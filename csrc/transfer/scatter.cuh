@@ -15,7 +15,7 @@
 // The contribution of a particle to a node is N_i (a + B · i) + G · ∇N_i, i being the distance from the base node in
 // cells: `Linear` channels of this kind after `Plain` ones with B = G = 0. In deterministic mode particles are linked
 // in the order of the index tensor, and the result of an item is added in fixed point, or block by block: blocks of one
-// colour at a time; blocks of one colour share no node.
+// colour at a time, which share no node, or by tiles (transfer/tiles.h).
 namespace mpm::cuda {
 
 template <class T>
@@ -664,11 +664,7 @@ __device__ void flush_tile(const Nodes& nodes, const int slots[1 << D], const T*
     if (!wanted || t % lanes != 0) continue;
     if (tile) {
       T* const stored = tile + (tile_row * S::row_quads + quad) * 4;
-      if (adds || Round > 0) {
-        const Vec4<T> before = load_vec4(stored);
-#pragma unroll
-        for (int e = 0; e < 4; e++) value.e[e] += before.e[e];
-      }
+      if (adds || Round > 0) value += load_vec4(stored);
       store_vec4(stored, value);
       continue;
     }
@@ -689,7 +685,8 @@ __device__ void flush_tile(const Nodes& nodes, const int slots[1 << D], const T*
   }
 }
 
-// Adds the particles in shared memory to the nodes, or to a tile as `flush_tile`; `add_strays` adds those in no list.
+// Adds the particles in shared memory to the nodes, or to a tile as `flush_tile`; `add_out_of_block`
+// adds those in no list.
 // `when_added` is called when their memory is no longer needed. All threads have to wait before that memory is reused.
 template <class S, class Nodes, class AddOutOfBlock, class WhenAdded>
 __device__ void add_particles(const Nodes& nodes, const SharedParticles<S>& shared, const int* slots, bool in_order,
@@ -765,13 +762,13 @@ __device__ void scatter_item(const Source& source, const Topology<typename Sourc
 // its place in the index, the inputs of a particle; contribution(loaded), its contribution; and optionally is_due(),
 // whether there is work, and skip(p, place) for a particle outside.
 //
-// Sums in no order: every item, with atomics. Otherwise base blocks, whole: those of a colour without atomics, or all
-// with tiles.
-enum Colour : int { kTiled = -2, kNoOrder = -1 };
+// A pass over the items: sums in no order, of every item, with atomics; or of whole base blocks, those of a colour
+// without atomics, or all with tiles.
+constexpr int kTiled = -2, kNoOrder = -1;
 
 template <class Source>
 __global__ void __launch_bounds__(Source::Shape::threads, Source::resident)
-    scatter_kernel(const Source source, int colour) {
+    scatter_kernel(const Source source, int pass) {
   using S = typename Source::Shape;
   using T = typename S::T;
   constexpr int D = S::D;
@@ -782,7 +779,7 @@ __global__ void __launch_bounds__(Source::Shape::threads, Source::resident)
   __shared__ ScatterMemory<S, Source::displaced> shared;
   const Topology<T, D>& t = source.topology;
   const Schedule<const int> schedule = schedule_of(t);
-  const bool in_order = colour != kNoOrder;
+  const bool in_order = pass != kNoOrder;
   const int4* const items = reinterpret_cast<const int4*>(schedule.items);
   const int count = *schedule.item_count;
   int4 entries = items[blockIdx.x];  // without waiting for the count: the space suffices
@@ -791,11 +788,11 @@ __global__ void __launch_bounds__(Source::Shape::threads, Source::resident)
     i += gridDim.x;
     if (i < count) entries = items[i];
     if (in_order) {
-      if (colour != kTiled && block_colour(t.geometry, item.block) != colour) continue;
+      if (pass != kTiled && block_colour(t.geometry, item.block) != pass) continue;
       if (item.begin != t.offsets[item.slot]) continue;
       item.end = t.offsets[item.slot + 1];
     }
-    T* const tile = colour == kTiled ? source.nodes.tiles + int64_t(item.slot) * kTileWords<S> : nullptr;
+    T* const tile = pass == kTiled ? source.nodes.tiles + int64_t(item.slot) * kTileWords<S> : nullptr;
     scatter_item(source, t, item, in_order, memory, shared, tile);
   }
   if constexpr (requires { source.skip(0, 0); }) {
@@ -806,62 +803,66 @@ __global__ void __launch_bounds__(Source::Shape::threads, Source::resident)
   }
 }
 
-constexpr int kTileThreads = 256;
-
 // Adds the sums of the tiles to the nodes: a thread for four words of a row of nodes along the last axis.
 template <class S>
 __global__ void __launch_bounds__(kTileThreads)
     add_tiles_kernel(const Topology<typename S::T, S::D> t, const NodeField<typename S::T> nodes) {
   using T = typename S::T;
-  constexpr int D = S::D, K = S::channels, rows = kBlockNodes<D> / kBlockWidth;
+  constexpr int D = S::D, K = S::channels;
   grid_dependency_sync();
-  const int i = int(blockIdx.x) * kTileThreads + int(threadIdx.x), quad = i % K, slot = i / K / rows;
-  if (slot >= t.max_blocks || t.block[slot] < 0) return;
-  int block[D], node[D] = {};
-  const int scene = block_coordinates(t.geometry, t.block[slot], block);
-  if (scene >= t.scenes) return;
+  const int i = int(blockIdx.x) * kTileThreads + int(threadIdx.x), quad = i % K;
+  at_row_of_nodes(t, i / K, [&](int scene, const int (&block)[D], const int (&node)[D], int64_t first) {
+    Vec4<T> sum{};
+    for_base_blocks(t, scene, block, [&](int from, int before) {
+      const int row = row_of_tile<S::width>(node, before), far = before & 1;
+      if (row < 0 || (far && quad >= S::far_quads)) return;
+      const int at = row * S::row_quads + (far ? S::near_quads : 0) + quad;
+      sum += load_vec4(nodes.tiles + int64_t(from) * kTileWords<S> + 4 * at);
+    });
 #pragma unroll
-  for (int axis = D - 2, rest = i / K % rows; axis >= 0; axis--, rest /= kBlockWidth) node[axis] = rest % kBlockWidth;
-  Vec4<T> sum{};
-  for_base_blocks(t, scene, block, [&](int from, int before) {
-    const int row = row_of_tile<S::width>(node, before), far = before & 1;
-    if (row < 0 || (far && quad >= S::far_quads)) return;
-    const int at = row * S::row_quads + (far ? S::near_quads : 0) + quad;
-    const Vec4<T> one = load_vec4(nodes.tiles + int64_t(from) * kTileWords<S> + 4 * at);
-#pragma unroll
-    for (int e = 0; e < 4; e++) sum.e[e] += one.e[e];
+    for (int e = 0; e < 4; e++) {
+      const int word = 4 * quad + e;
+      nodes.pointer[(first + word / K) * nodes.stride + word % K] += sum.e[e];
+    }
   });
-  const int64_t first = int64_t(slot) * kBlockNodes<D> + node_in_block<D>(node);
-#pragma unroll
-  for (int e = 0; e < 4; e++) {
-    const int word = 4 * quad + e;
-    nodes.pointer[(first + word / K) * nodes.stride + word % K] += sum.e[e];
-  }
+}
+
+// Sums in no order.
+template <class Source>
+void launch_scatter(const Source& source, Stream stream) {
+  using S = typename Source::Shape;
+  const int64_t items = most_items(source.topology.max_blocks, source.topology.particles);
+  if (items == 0) return;
+  launch_in_chain(scatter_kernel<Source>, grid_size(source, items), S::threads, S::shared_bytes, stream, source,
+                  kNoOrder);
 }
 
 template <class Source>
-void launch_scatter(const Source& source, bool deterministic, Stream stream) {
+void launch_scatter_in_order(const Source& source, Stream stream) {
   using S = typename Source::Shape;
   const Topology<typename S::T, S::D>& t = source.topology;
   const int64_t items = most_items(t.max_blocks, t.particles);
   if (items == 0) return;
   const unsigned blocks = grid_size(source, items);
-  const auto launch_colour = [&](int colour, unsigned count) {
-    launch_in_chain(scatter_kernel<Source>, count, S::threads, S::shared_bytes, stream, source, colour);
+  const auto launch_pass = [&](int pass, unsigned count) {
+    launch_in_chain(scatter_kernel<Source>, count, S::threads, S::shared_bytes, stream, source, pass);
   };
-  if (!deterministic) return launch_colour(kNoOrder, blocks);
   if constexpr (S::channels <= kTileChannels) {
     static_assert(kTileWords<S> <= tile_words<S::D>(S::Order));
     if (source.nodes.tiles) {
-      launch_colour(kTiled, blocks);
-      const int64_t threads = int64_t(t.max_blocks) * (kBlockNodes<S::D> / kBlockWidth) * S::channels;
-      return launch_in_chain(add_tiles_kernel<S>, unsigned((threads + kTileThreads - 1) / kTileThreads), kTileThreads,
-                             0, stream, t, NodeField<typename S::T>(source.nodes));
+      launch_pass(kTiled, blocks);
+      return launch_in_chain(add_tiles_kernel<S>, blocks_for_rows(t, S::channels), kTileThreads, 0, stream, t,
+                             NodeField<typename S::T>(source.nodes));
     }
   }
   // Of a colour most items are skipped, and then each thread block costs time.
   const unsigned most = unsigned(device_attribute(cudaDevAttrMultiProcessorCount)) * 8;
-  for (int colour = 0; colour < 1 << S::D; colour++) launch_colour(colour, std::min(blocks, most));
+  for (int colour = 0; colour < 1 << S::D; colour++) launch_pass(colour, std::min(blocks, most));
+}
+
+template <class Source>
+void launch_scatter(const Source& source, bool deterministic, Stream stream) {
+  deterministic ? launch_scatter_in_order(source, stream) : launch_scatter(source, stream);
 }
 
 enum class Stress { none, moment, gradient };

@@ -38,4 +38,28 @@ __device__ int row_of_tile(const int (&node)[D], int before) {
   return has ? row : -1;
 }
 
+constexpr int kTileThreads = 256;
+
+// Calls f(scene, block, node, row of the node) for a row of nodes along the last axis, number i of all slots, where its
+// block is one of the scenes.
+template <class T, int D, class F>
+__device__ void at_row_of_nodes(const Topology<T, D>& t, int i, const F& f) {
+  constexpr int rows = kBlockNodes<D> / kBlockWidth;
+  const int slot = i / rows;
+  if (slot >= t.max_blocks || t.block[slot] < 0) return;
+  int block[D], node[D] = {};
+  const int scene = block_coordinates(t.geometry, t.block[slot], block);
+  if (scene >= t.scenes) return;
+#pragma unroll
+  for (int axis = D - 2, rest = i % rows; axis >= 0; axis--, rest /= kBlockWidth) node[axis] = rest % kBlockWidth;
+  f(scene, block, node, int64_t(i) * kBlockWidth);
+}
+
+// Thread blocks of kTileThreads for `each` threads to a row of nodes.
+template <class T, int D>
+unsigned blocks_for_rows(const Topology<T, D>& t, int each) {
+  const int64_t threads = int64_t(t.max_blocks) * (kBlockNodes<D> / kBlockWidth) * each;
+  return unsigned((threads + kTileThreads - 1) / kTileThreads);
+}
+
 }  // namespace mpm::cuda

@@ -130,6 +130,20 @@ def test_deterministic_grids_repeat_the_heat(dim, device):
     assert all(torch.equal(value, ends[1].extra[name]) for name, value in ends[0].extra.items())
 
 
+@pytest.mark.parametrize("kernel", ["quadratic", "cubic"])
+def test_the_heat_of_a_scene_does_not_depend_on_the_others(dim, kernel, device):
+    """To the last bit on deterministic grids, with particles for one and for several items of the CUDA kernels."""
+    options = {"kernel": kernel, "deterministic": True, "per_cell": 25 if dim == 2 else 8, "max_blocks": 3 ** (dim + 1)}
+    step, state = scene(dim, torch.float32, scenes=3, melts=True, device=device, **options)
+    alone = state.select((state.scene == 1).nonzero()[:, 0])
+    with torch.no_grad():
+        together, own = (mpm.rollout(step, s, 20, DT) for s in (state, alone))
+    rows = state.scene == 1
+    for name in ("x", "v", "temperature"):
+        assert torch.equal(getattr(together, name)[rows], getattr(own, name)), name
+    assert torch.equal(together.extra["liquid"][rows], own.extra["liquid"])
+
+
 def test_stiff_conduction_agrees(device):
     """Diffusion numbers far above one take many iterations."""
     step, state = scene(2, device=device)

@@ -156,6 +156,16 @@ class _Sizes:
         products = _SIMPLE_STEPS if self._cuda else 0
         return 5 + (2 if self._cuda else 1) * (4 + 2 + 4 + products) + 6
 
+    def _tiles(self, resident: bool) -> int:
+        """Numbers per block for sums of heat with an order on CUDA: tiles of the products of a solve
+        (`PackedItems::kTile` in csrc/heat/operator.cuh), and of the transfers to the nodes (csrc/transfer/tiles.h)
+        where steps are not differentiated."""
+        if self._heat is None or not (self._cuda and self._step.grid.deterministic):
+            return 0
+        width = 4 + (3 if self._step.grid.kernel == "cubic" else 2)
+        of_products = 7 * 8 if self._dim == 2 else 7 * (7 * 8 + 4)
+        return of_products + (4 * width**self._dim if resident else 0)
+
     # ---- calls
 
     def backward(self, dt: float | Tensor) -> int:
@@ -196,6 +206,7 @@ class _Sizes:
             products = _SIMPLE_STEPS if self._cuda else 0
             of_terms = sum(isinstance(term, Term) for term in self._heat.boundaries.entries)
             numbers += self._nodes(1) * (self._heat_nodes() + 6 + 4 + 2 + 8 + 8 + products) + 2 * of_terms + 20
+            numbers += 2 * self._tiles(resident=False)  # Of the steps and of the adjoint solves.
         return rows * self._node_rows() + self._slots * numbers * self._size + self._grid_bytes()
 
     def forward(self, dt: float | Tensor) -> int:
@@ -210,6 +221,7 @@ class _Sizes:
         nodes = 3 * self._node_rows(slots) + self._grid_bytes(slots)
         if self._heat is not None:
             nodes += self._nodes(slots) * self._heat_nodes() * self._size
+            nodes += slots * self._tiles(resident=True) * self._size
         return self._rows(2 * columns + self._matrix + thermal) + self._activation() + nodes
 
     def _activation(self) -> int:
