@@ -35,7 +35,7 @@ struct NodePush {
   int body[D];
   unsigned numbers = 0;            // of the bodies of the surfaces, two bits each
   Vector<double, D> at, position;  // [m]
-  double impulse[D][D];            // by body and axis [N s]
+  Vector<double, D> impulse[D];    // by body [N s]
 
   MPM_HD int number_of(int surface) const { return int(numbers >> 2 * surface & 3); }
 };
@@ -176,12 +176,11 @@ MPM_HD_CALL void take_from_node(bool wanted, const BodyNode<T, D>& node, const V
 // Sets the impulses of a node by its mass.
 template <class T, int D>
 MPM_HD void set_impulses(const T& mass, const TakenVelocities<T, D>& taken, NodePush<T, D>& push) {
-  MPM_UNROLL for (int k = 0; k < D; k++) MPM_UNROLL
-    for (int axis = 0; axis < D; axis++) push.impulse[k][axis] = 0;
+  MPM_UNROLL for (int k = 0; k < D; k++)
+    push.impulse[k] = zero_vector<double, D>();
   MPM_LOOP for (int i = 0; i < taken.count; i++) {
-    double (&impulse)[D] = push.impulse[push.number_of(i)];
-    MPM_UNROLL for (int axis = 0; axis < D; axis++)
-      impulse[axis] += double(mass * taken.taken[i][axis]);
+    Vector<double, D>& impulse = push.impulse[push.number_of(i)];
+    impulse = impulse + as_double(mass * taken.taken[i]);
   }
 }
 

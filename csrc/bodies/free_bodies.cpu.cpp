@@ -93,9 +93,7 @@ struct OneThread {
     set_impulses(mass, taken, push);
     for (int number = 0; number < push.bodies; number++) {
       const int k = push.body[number];
-      Vector<double, D> impulse;
-      std::copy_n(push.impulse[number], D, impulse.e);
-      add_impulse(arm_from(scene.now[k], push.at), impulse, sums + k * n);
+      add_impulse(arm_from(scene.now[k], push.at), push.impulse[number], sums + k * n);
     }
   }
 

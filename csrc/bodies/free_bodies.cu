@@ -431,12 +431,7 @@ struct BlockTeam {
     MPM_LOOP for (int number = 0; any_of_warp(number < push.bodies); number++) {
       const int k = number < push.bodies ? push.body[number] : -1;
       double along[n];
-      if (k >= 0) {
-        Vector<double, D> impulse;
-#pragma unroll
-        for (int axis = 0; axis < D; axis++) impulse[axis] = push.impulse[number][axis];
-        set_along_motions(arm_from(memory.now[k], push.at), impulse, along);
-      }
+      if (k >= 0) set_along_motions(arm_from(memory.now[k], push.at), push.impulse[number], along);
       sums.add(k, along);
     }
   }

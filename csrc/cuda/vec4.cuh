@@ -21,5 +21,9 @@ __device__ void operator+=(Vec4<T>& a, const Vec4<T>& b) {
 #pragma unroll
   for (int e = 0; e < 4; e++) a.e[e] += b.e[e];
 }
+template <class T>
+__device__ bool is_zero(const Vec4<T>& v) {
+  return v.e[0] == T(0) && v.e[1] == T(0) && v.e[2] == T(0) && v.e[3] == T(0);
+}
 
 }  // namespace mpm::cuda

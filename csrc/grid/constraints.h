@@ -187,8 +187,7 @@ MPM_HD void changes_of_constraints(const Constraints<S, D>& c, const Vector<S, D
     change[0] = contact_velocity(only.kind, u, only.normal, only.friction) + S(-1) * u;
     return;
   }
-  constexpr bool few = sizeof(S) <= sizeof(double);  // Instances for dual numbers of doubles would be long.
-  if constexpr (few) {
+  if constexpr (sizeof(S) <= sizeof(double)) {  // Instances for dual numbers of doubles would be long.
     if (c.count == 2) return changes_of_several<2>(c, v, change);
     if (c.count == 3) return changes_of_several<3>(c, v, change);
   }

@@ -269,11 +269,6 @@ __device__ Vec4<T> sum_of_warps(const T (*sums)[N], int at) {
   return sum;
 }
 
-template <class T>
-__device__ bool is_zero(const Vec4<T>& v) {
-  return v.e[0] == T(0) && v.e[1] == T(0) && v.e[2] == T(0) && v.e[3] == T(0);
-}
-
 // Least number of thread blocks of a multiprocessor; of many items as many threads as in csrc/heat/heat.cu.
 template <int Warps, int Order, class T>
 constexpr int kProductBlocks = Warps == 1 && Order == 2 && sizeof(T) == 4 ? 5 : 2;

@@ -668,7 +668,7 @@ __device__ void flush_tile(const Nodes& nodes, const int slots[1 << D], const T*
       store_vec4(stored, value);
       continue;
     }
-    if (value.e[0] == T(0) && value.e[1] == T(0) && value.e[2] == T(0) && value.e[3] == T(0)) continue;
+    if (is_zero(value)) continue;
     const int64_t row = int64_t(slot) * kBlockNodes<D> + node_in_block<D>(node);
     if (is_fixed(nodes)) {
       add_fixed_words<S>(nodes, row, first_word, value.e);
@@ -685,9 +685,9 @@ __device__ void flush_tile(const Nodes& nodes, const int slots[1 << D], const T*
   }
 }
 
-// Adds the particles in shared memory to the nodes, or to a tile as `flush_tile`; `add_out_of_block`
-// adds those in no list.
-// `when_added` is called when their memory is no longer needed. All threads have to wait before that memory is reused.
+// Adds the particles in shared memory to the nodes, or to a tile as `flush_tile`; `add_out_of_block` adds those in no
+// list. `when_added` is called when their memory is no longer needed. All threads have to wait before that memory is
+// reused.
 template <class S, class Nodes, class AddOutOfBlock, class WhenAdded>
 __device__ void add_particles(const Nodes& nodes, const SharedParticles<S>& shared, const int* slots, bool in_order,
                               const AddOutOfBlock& add_out_of_block, const WhenAdded& when_added,
@@ -758,14 +758,13 @@ __device__ void scatter_item(const Source& source, const Topology<typename Sourc
   }
 }
 
-// Source: topology, nodes, position; whether particles may be displaced; load(p, scene), or load(p, scene, place) with
-// its place in the index, the inputs of a particle; contribution(loaded), its contribution; and optionally is_due(),
-// whether there is work, and skip(p, place) for a particle outside.
-//
 // A pass over the items: sums in no order, of every item, with atomics; or of whole base blocks, those of a colour
 // without atomics, or all with tiles.
 constexpr int kTiled = -2, kNoOrder = -1;
 
+// Source: topology, nodes, position; whether particles may be displaced; load(p, scene), or load(p, scene, place) with
+// its place in the index, the inputs of a particle; contribution(loaded), its contribution; and optionally is_due(),
+// whether there is work, and skip(p, place) for a particle outside.
 template <class Source>
 __global__ void __launch_bounds__(Source::Shape::threads, Source::resident)
     scatter_kernel(const Source source, int pass) {

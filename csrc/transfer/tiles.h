@@ -4,9 +4,9 @@
 
 #include "grid/geometry.h"
 
-// Sums over particles with an order, on CUDA: a thread block stores those of a base block in a tile, which holds the
-// nodes of the block and the next ones that its particles reach; then each node adds those of the tiles that have it,
-// in the order of the base blocks. All particles are in their base blocks.
+// Sums over particles with an order, on CUDA: those of a base block are stored in a tile, which holds the nodes of the
+// block and the next ones that its particles reach; then each node adds those of the tiles that have it, in the order
+// of the base blocks. All particles are in their base blocks.
 namespace mpm {
 
 constexpr int kTileChannels = 4;  // at most
