@@ -40,10 +40,10 @@ struct NodePush {
   MPM_HD int number_of(int surface) const { return int(numbers >> 2 * surface & 3); }
 };
 
-// Derivatives of the impulses [body][axis] of a node by the velocity of one of its bodies along one axis.
+// Derivatives of the impulses of a node on each body by the velocity of one of them.
 template <class T, int D>
-struct PushSlope {
-  T of[D][D];
+struct PushSlopes {
+  Matrix<T, D> of[D];
 };
 
 template <class T, int D>
@@ -192,30 +192,23 @@ MPM_HD Vector<T, D> without(const TakenVelocities<T, D>& taken, Vector<T, D> v) 
   return v;
 }
 
-// Sets the derivatives of the impulses of a node by the velocity of a body along an axis, by dual numbers.
+// Sets the derivatives of the impulses of a node by the velocity of one of its bodies.
 template <class T, int D>
 MPM_HD_CALL void set_slopes(bool wanted, const BodyNode<T, D>& node, const T& mass, const Vector<T, D>& v,
-                            const NodePush<T, D>& push, int by, int by_axis, PushSlope<T, D>& slope) {
+                            const NodePush<T, D>& push, int by, PushSlopes<T, D>& slopes) {
   if (!wanted) return;
-  using S = Dual<T>;
   const Constraints<T, D>& c = node.met.constraints;
-  Constraints<S, D> lifted;
-  MPM_LOOP for (int i = 0; i < c.count; i++) {
-    add_constant(c.e[i], lifted);
-    const bool moves = c.e[i].owner >= 0 && push.number_of(i) == by;
-    MPM_UNROLL for (int axis = 0; axis < D; axis++)
-      if (moves && axis == by_axis) lifted.e[i].velocity[axis].derivative = T(1);
-  }
-  Vector<S, D> before, change[Constraints<S, D>::most];
-  MPM_UNROLL for (int axis = 0; axis < D; axis++)
-    before[axis] = lift<S>(node.met.sign[axis] * v[axis]);
-  changes_of_constraints<S, D>(lifted, before, change);
-  slope = {};
-  MPM_LOOP for (int i = 0; i < c.count; i++) {
-    T(&own)[D] = slope.of[push.number_of(i)];
-    MPM_UNROLL for (int axis = 0; axis < D; axis++)
-      own[axis] -= mass * node.met.sign[axis] * change[i][axis].derivative;
-  }
+  unsigned moved = 0;
+  MPM_LOOP for (int i = 0; i < c.count; i++)
+    moved |= unsigned(c.e[i].owner >= 0 && push.number_of(i) == by) << i;
+  slopes = {};
+  slopes_of_constraints(c, reflected(node.met.sign, v), moved, [&](int axis, const auto& change) {
+    MPM_LOOP for (int i = 0; i < c.count; i++) {
+      Matrix<T, D>& own = slopes.of[push.number_of(i)];
+      MPM_UNROLL for (int j = 0; j < D; j++)
+        own[j][axis] -= mass * node.met.sign[j] * change[i][j];
+    }
+  });
 }
 
 // ---- sums over nodes: impulses on the motions of bodies, and their derivatives
@@ -255,13 +248,13 @@ MPM_HD void set_slope_block(const Slope& slope, const Vector<T, D>& at, const Ve
   }
 }
 
-// Of one body of a node, by the velocity of one of them along an axis, for `set_slope_block`.
+// Of one body of a node, by the velocity of one of them, for `set_slope_block`.
 template <class T, int D>
-MPM_HD auto slope_by_axis(const PushSlope<T, D>& slope, int number, int by_axis) {
-  return [&slope, number, by_axis](int axis) {
+MPM_HD auto slope_of(const PushSlopes<T, D>& slopes, int number) {
+  return [&slopes, number](int axis) {
     Vector<T, D> row;
     MPM_UNROLL for (int i = 0; i < D; i++)
-      row[i] = i == by_axis ? slope.of[number][axis] : T(0);
+      row[i] = slopes.of[number][axis][i];
     return row;
   };
 }

@@ -51,8 +51,7 @@ struct OneThread {
       NodePush<T, D> push{};
       set_bodies(a.contact, a.owner, node, push);
       if (impulses) add_impulses(scene, node, mass, v, push, impulses);
-      for (int by = 0; slopes && by < push.bodies; by++)
-        for (int axis = 0; axis < D; axis++) add_slopes_by(scene, node, mass, v, push, by, axis, slopes);
+      for (int by = 0; slopes && by < push.bodies; by++) add_slopes_by(scene, node, mass, v, push, by, slopes);
     });
   }
 
@@ -97,16 +96,16 @@ struct OneThread {
     }
   }
 
-  // Derivatives of the impulses on all bodies by the velocity of one along an axis.
+  // Derivatives of the impulses on all bodies by the velocity of one.
   template <class Scene>
   void add_slopes_by(const Scene& scene, const BodyNode<T, D>& node, const T& mass, const Vector<T, D>& v,
-                     const NodePush<T, D>& push, int by, int axis, double* sums) const {
-    PushSlope<T, D> slope;
-    set_slopes(true, node, mass, v, push, by, axis, slope);
+                     const NodePush<T, D>& push, int by, double* sums) const {
+    PushSlopes<T, D> slopes;
+    set_slopes(true, node, mass, v, push, by, slopes);
     const int l = push.body[by];
     for (int number = 0; number < push.bodies; number++) {
       const int k = push.body[number];
-      add_slopes(slope_by_axis(slope, number, axis), rounded_arm_from<T>(scene.now[k], push.at),
+      add_slopes(slope_of(slopes, number), rounded_arm_from<T>(scene.now[k], push.at),
                  rounded_arm_from<T>(scene.now[l], push.position), k, l, sums);
     }
   }

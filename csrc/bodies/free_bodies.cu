@@ -374,14 +374,11 @@ struct BlockTeam {
       return slopes + (int64_t((pair >> 8) * n + e / n) * m + (pair & 255) * n + e % n);
     };
     SumsByKey<n * n, T, decltype(slope_of)> of_slopes(slope_of);
-    constexpr int tile = 32, seeded = 32 / D;  // nodes of a warp
+    constexpr int tile = 32;  // nodes of a warp
     for (int first = warp * tile; first < lone_count; first += adders * tile)
       add_lone_node(first + lane(), impulses, of_impulses, slopes, of_slopes);
-    for (int first = warp * tile; impulses && first < count; first += adders * tile)
-      add_impulses(first + lane(), of_impulses);
-    const int node = lane() / D;  // the last lanes have none
-    for (int first = warp * seeded; slopes && first < count; first += adders * seeded)
-      add_slopes(node < seeded ? first + node : count, lane() % D, of_slopes);
+    for (int first = warp * tile; first < count; first += adders * tile)
+      add_node(first + lane(), impulses, of_impulses, slopes, of_slopes);
     of_impulses.finish();
     of_slopes.finish();
   }
@@ -410,24 +407,31 @@ struct BlockTeam {
     if (wants_slopes) slopes.add(pair_of(k, k), block);
   }
 
-  // Impulses of a node on its bodies.
-  template <class Sums>
-  __device__ void add_impulses(int i, Sums& sums) const {
+  // A node that is not lone.
+  template <class Impulses, class Slopes>
+  __device__ void add_node(int i, bool wants_impulses, Impulses& impulses, bool wants_slopes, Slopes& slopes) const {
     const bool wanted = i < count;
     BodyNode<T, D> node;
     NodePush<T, D> push;
     T mass;
     Vector<T, D> v;
     load(wanted, i, node, mass, v);
+    if (wanted) set_bodies(a.contact, a.owner, node, push);
+    if (wants_impulses) add_impulses(wanted, node, mass, v, push, impulses);
+    MPM_LOOP for (int by = 0; wants_slopes && any_of_warp(by < push.bodies); by++)
+      add_slopes_by(by < push.bodies, node, mass, v, push, by, slopes);
+  }
+
+  // Impulses of a node on its bodies.
+  template <class Sums>
+  __device__ void add_impulses(bool wanted, const BodyNode<T, D>& node, const T& mass, const Vector<T, D>& v,
+                               NodePush<T, D>& push, Sums& sums) const {
     TakenVelocities<T, D> taken;
     if (any_of_warp(wanted)) {
       take_from_node(wanted, node, v, taken);
       join_warp();
     }
-    if (wanted) {
-      set_bodies(a.contact, a.owner, node, push);
-      set_impulses(mass, taken, push);
-    }
+    if (wanted) set_impulses(mass, taken, push);
     MPM_LOOP for (int number = 0; any_of_warp(number < push.bodies); number++) {
       const int k = number < push.bodies ? push.body[number] : -1;
       double along[n];
@@ -436,30 +440,23 @@ struct BlockTeam {
     }
   }
 
-  // Derivatives of the impulses of a node on its bodies by the velocities of these along an axis.
+  // Derivatives of the impulses of a node on its bodies by the velocity of one of these.
   template <class Sums>
-  __device__ void add_slopes(int i, int axis, Sums& sums) const {
-    const bool wanted = i < count;
-    BodyNode<T, D> node;
-    NodePush<T, D> push;
-    PushSlope<T, D> slope;
-    T mass;
-    Vector<T, D> v;
-    load(wanted, i, node, mass, v);
-    if (wanted) set_bodies(a.contact, a.owner, node, push);
-    MPM_LOOP for (int by = 0; any_of_warp(by < push.bodies); by++) {
-      const bool acts = by < push.bodies;
-      set_slopes(acts, node, mass, v, push, by, axis, slope);
+  __device__ void add_slopes_by(bool acts, const BodyNode<T, D>& node, const T& mass, const Vector<T, D>& v,
+                                const NodePush<T, D>& push, int by, Sums& sums) const {
+    PushSlopes<T, D> slopes;
+    if (any_of_warp(acts)) {
+      set_slopes(acts, node, mass, v, push, by, slopes);
       join_warp();
-      const int l = acts ? push.body[by] : -1;
-      MPM_LOOP for (int number = 0; any_of_warp(acts && number < push.bodies); number++) {
-        const int k = acts && number < push.bodies ? push.body[number] : -1;
-        T block[n * n];
-        if (k >= 0)
-          set_slope_block(slope_by_axis(slope, number, axis), rounded_arm_from<T>(memory.now[k], push.at),
-                          rounded_arm_from<T>(memory.now[l], push.position), block);
-        sums.add(pair_of(k, l), block);
-      }
+    }
+    const int l = acts ? push.body[by] : -1;
+    MPM_LOOP for (int number = 0; any_of_warp(acts && number < push.bodies); number++) {
+      const int k = acts && number < push.bodies ? push.body[number] : -1;
+      T block[n * n];
+      if (k >= 0)
+        set_slope_block(slope_of(slopes, number), rounded_arm_from<T>(memory.now[k], push.at),
+                        rounded_arm_from<T>(memory.now[l], push.position), block);
+      sums.add(pair_of(k, l), block);
     }
   }
 

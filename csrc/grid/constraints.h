@@ -1,6 +1,7 @@
 #pragma once
 
 #include <limits>
+#include <type_traits>
 
 #include "common/warp.h"
 #include "grid/friction.h"
@@ -114,60 +115,142 @@ MPM_HD unsigned stopped_velocities(const Constraints<S, D>& c, const Vector<S, D
   return best;
 }
 
-// Adds the change of a velocity v by friction along the surfaces of a set that stop λ, in parts by surface.
+// Friction of a velocity v along the surfaces of a set that stop λ: surface i changes v by −(limit_i / size)
+// tangential.
+template <class S, int D>
+struct Rubbing {
+  bool acts = false;                                          // otherwise limits and tangential are zero
+  bool sticks = false;                                        // whether it takes all of the tangential velocity
+  S limit[Constraints<S, D>::most], sum = S(0), size = S(1);  // size: that of the velocity, or the sum if it sticks
+  Vector<S, D> surface = zero_vector<S, D>();                 // their mean velocity by limits
+  Vector<S, D> tangential = zero_vector<S, D>();              // of v relative to it
+};
+
 template <int N, class S, int D>
-MPM_HD void add_friction(const Constraints<S, D>& c, unsigned set, const S (&lambda)[Constraints<S, D>::most],
-                         const Vector<S, D>& v, Vector<S, D> (&change)[Constraints<S, D>::most]) {
+MPM_HD Rubbing<S, D> rubbing(const Constraints<S, D>& c, unsigned set, const S (&lambda)[Constraints<S, D>::most],
+                             const Vector<S, D>& v) {
   const int count = number_of<N>(c);
-  S limit[Constraints<S, D>::most], sum = S(0);
-  Vector<S, D> surface = zero_vector<S, D>();
+  Rubbing<S, D> r;
   bool rubs = false;
   MPM_LOOP_OF(N) for (int i = 0; i < count; i++) {
-    limit[i] = S(0);
+    r.limit[i] = S(0);
     if (!(lambda[i] > S(0)) || !has_friction(c.e[i].friction)) continue;
     rubs = true;
-    limit[i] = c.e[i].friction * lambda[i];
-    sum = sum + limit[i];
-    surface = surface + limit[i] * c.e[i].velocity;
+    r.limit[i] = c.e[i].friction * lambda[i];
+    r.sum = r.sum + r.limit[i];
+    r.surface = r.surface + r.limit[i] * c.e[i].velocity;
   }
-  if (!rubs) return;
-  if (sum > S(0)) {
-    surface = (S(1) / sum) * surface;
+  if (!rubs) return r;
+  if (r.sum > S(0)) {
+    r.surface = (S(1) / r.sum) * r.surface;
   } else {  // a coefficient of zero whose derivative is wanted
-    surface = zero_vector<S, D>();
+    r.surface = zero_vector<S, D>();
     MPM_LOOP_OF(N) for (int i = 0; i < count; i++) {
-      if (lambda[i] > S(0) && has_friction(c.e[i].friction)) surface = c.e[i].velocity;
+      if (lambda[i] > S(0) && has_friction(c.e[i].friction)) r.surface = c.e[i].velocity;
     }
   }
-  const Vector<S, D> u = v + S(-1) * surface;
+  const Vector<S, D> u = v + S(-1) * r.surface;
   S normal[Constraints<S, D>::most];
   MPM_LOOP_OF(N) for (int i = 0; i < count; i++) normal[i] = dot(c.e[i].normal, u);
-  if (!solve_normals<N, S, D>(c, set, normal)) return;
+  if (!solve_normals<N, S, D>(c, set, normal)) return r;
   Vector<S, D> tangential = u;
   MPM_LOOP_OF(N) for (int i = 0; i < count; i++) tangential = tangential + (S(0) - normal[i]) * c.e[i].normal;
   const S squared = dot(tangential, tangential);
-  if (!(squared > S(0))) return;
-  const S speed = sqrt(squared);
-  if (!(sum < speed)) {
-    MPM_LOOP_OF(N) for (int i = 0; i < count; i++) change[i] = change[i] + (S(0) - limit[i] / sum) * tangential;
-    return;
-  }
-  MPM_LOOP_OF(N) for (int i = 0; i < count; i++) change[i] = change[i] + (S(0) - limit[i] / speed) * tangential;
+  if (!(squared > S(0))) return r;
+  r.acts = true;
+  r.tangential = tangential;
+  r.size = sqrt(squared);
+  r.sticks = !(r.sum < r.size);
+  if (r.sticks) r.size = r.sum;
+  return r;
 }
 
 // Changes of a velocity v by surfaces that are not sticky.
 template <int N, class S, int D>
-MPM_HD void changes_of_several(const Constraints<S, D>& c, const Vector<S, D>& v,
-                               Vector<S, D> (&change)[Constraints<S, D>::most]) {
-  const int count = number_of<N>(c);
-  S lambda[Constraints<S, D>::most];
-  const unsigned set = stopped_velocities<N>(c, v, lambda);
-  Vector<S, D> after = v;
-  MPM_LOOP_OF(N) for (int i = 0; i < count; i++) {
-    change[i] = lambda[i] * c.e[i].normal;
-    after = after + change[i];
+struct ChangesOfSeveral {
+  static constexpr int most = Constraints<S, D>::most;
+  const Constraints<S, D>& c;
+  S lambda[most];
+  unsigned set;
+  Rubbing<S, D> friction;
+
+  MPM_HD ChangesOfSeveral(const Constraints<S, D>& c, const Vector<S, D>& v) : c(c) {
+    set = stopped_velocities<N>(c, v, lambda);
+    Vector<S, D> after = v;
+    MPM_LOOP_OF(N) for (int i = 0; i < number_of<N>(c); i++) after = after + lambda[i] * c.e[i].normal;
+    friction = rubbing<N>(c, set, lambda, after);
   }
-  add_friction<N>(c, set, lambda, after, change);
+
+  MPM_HD void changes(Vector<S, D> (&change)[most]) const {
+    MPM_LOOP_OF(N) for (int i = 0; i < number_of<N>(c); i++) {
+      change[i] = lambda[i] * c.e[i].normal;
+      if (friction.acts) change[i] = change[i] + (S(0) - friction.limit[i] / friction.size) * friction.tangential;
+    }
+  }
+
+  // Derivatives of the changes by the velocity, along an axis, of the surfaces that are the bits of `moved`. Which
+  // surfaces press, and whether they stick, does not change.
+  MPM_HD void slopes(unsigned moved, int axis, Vector<S, D> (&slope)[most]) const {
+    const int count = number_of<N>(c);
+    S stopped[most];  // dλ
+    MPM_LOOP_OF(N) for (int i = 0; i < count; i++) stopped[i] = moved >> i & 1 ? component(c.e[i].normal, axis) : S(0);
+    solve_normals<N, S, D>(c, set, stopped);
+    MPM_LOOP_OF(N) for (int i = 0; i < count; i++) slope[i] = stopped[i] * c.e[i].normal;
+    if (friction.acts) add_slopes_of_friction(moved, axis, stopped, slope);
+  }
+
+ private:
+  MPM_HD static S component(const Vector<S, D>& v, int axis) {
+    S own = S(0);
+    MPM_UNROLL for (int i = 0; i < D; i++)
+      own = i == axis ? v[i] : own;
+    return own;
+  }
+
+  MPM_HD void add_slopes_of_friction(unsigned moved, int axis, const S (&stopped)[most],
+                                     Vector<S, D> (&slope)[most]) const {
+    const int count = number_of<N>(c);
+    const Rubbing<S, D>& r = friction;
+    S limit[most], sum = S(0);                   // their derivatives, as the next ones
+    Vector<S, D> surface = zero_vector<S, D>();  // times the sum
+    MPM_LOOP_OF(N) for (int i = 0; i < count; i++) {
+      limit[i] = lambda[i] > S(0) ? c.e[i].friction * stopped[i] : S(0);
+      sum = sum + limit[i];
+      surface = surface + limit[i] * (c.e[i].velocity + S(-1) * r.surface);
+      MPM_UNROLL for (int j = 0; j < D; j++)
+        if (j == axis && (moved >> i & 1)) surface[j] = surface[j] + r.limit[i];
+    }
+    // The velocity after the normal changes, which are along the normals, has no part in that of the tangential one.
+    S normal[most];
+    MPM_LOOP_OF(N) for (int i = 0; i < count; i++) normal[i] = dot(c.e[i].normal, surface);
+    solve_normals<N, S, D>(c, set, normal);
+    Vector<S, D> tangential = S(-1) * surface;
+    MPM_LOOP_OF(N) for (int i = 0; i < count; i++) tangential = tangential + normal[i] * c.e[i].normal;
+    tangential = (S(1) / r.sum) * tangential;
+    const S size = r.sticks ? sum : dot(r.tangential, tangential) / r.size;
+    MPM_LOOP_OF(N) for (int i = 0; i < count; i++) {
+      const S share = r.limit[i] / r.size, own = (limit[i] - share * size) / r.size;
+      slope[i] = slope[i] + (S(0) - own) * r.tangential + (S(0) - share) * tangential;
+    }
+  }
+};
+
+// Calls f(number), the number as an integral constant where there are functions for it, and else 0.
+template <class S, int D, class F>
+MPM_HD void with_number(const Constraints<S, D>& c, const F& f) {
+  if constexpr (sizeof(S) <= sizeof(double)) {  // Instances for dual numbers of doubles would be long.
+    if (c.count == 2) return f(std::integral_constant<int, 2>());
+    if (c.count == 3) return f(std::integral_constant<int, 3>());
+  }
+  f(std::integral_constant<int, 0>());
+}
+
+// The first sticky surface, or −1.
+template <class S, int D>
+MPM_HD int sticky_of(const Constraints<S, D>& c) {
+  MPM_LOOP for (int i = 0; i < c.count; i++)
+    if (c.e[i].kind == Contact::sticky) return i;
+  return -1;
 }
 
 // Changes of a velocity v by each surface.
@@ -176,22 +259,54 @@ MPM_HD void changes_of_constraints(const Constraints<S, D>& c, const Vector<S, D
                                    Vector<S, D> (&change)[Constraints<S, D>::most]) {
   MPM_LOOP for (int i = 0; i < c.count; i++)
     change[i] = zero_vector<S, D>();
-  MPM_LOOP for (int i = 0; i < c.count; i++) {
-    if (c.e[i].kind != Contact::sticky) continue;
-    change[i] = c.e[i].velocity + S(-1) * v;
-    return;
-  }
-  if (c.count == 1) {
+  const int sticky = sticky_of(c);
+  if (sticky >= 0) {
+    change[sticky] = c.e[sticky].velocity + S(-1) * v;
+  } else if (c.count == 1) {
     const Constraint<S, D>& only = c.e[0];
     const Vector<S, D> u = v + S(-1) * only.velocity;
     change[0] = contact_velocity(only.kind, u, only.normal, only.friction) + S(-1) * u;
+  } else {
+    with_number(c, [&](auto number) { ChangesOfSeveral<decltype(number)::value, S, D>(c, v).changes(change); });
+  }
+}
+
+// Calls f(axis, slope) with the derivatives of these changes by the velocity, along each axis, of the surfaces that are
+// the bits of `moved`.
+template <class T, int D, class F>
+MPM_HD void slopes_of_constraints(const Constraints<T, D>& c, const Vector<T, D>& v, unsigned moved, const F& f) {
+  Vector<T, D> slope[Constraints<T, D>::most];
+  MPM_LOOP for (int i = 0; i < c.count; i++)
+    slope[i] = zero_vector<T, D>();
+  const int sticky = sticky_of(c);
+  if (sticky < 0 && c.count > 1) {
+    with_number(c, [&](auto number) {
+      const ChangesOfSeveral<decltype(number)::value, T, D> changes(c, v);
+      MPM_LOOP for (int axis = 0; axis < D; axis++) {
+        changes.slopes(moved, axis, slope);
+        f(axis, slope);
+      }
+    });
     return;
   }
-  if constexpr (sizeof(S) <= sizeof(double)) {  // Instances for dual numbers of doubles would be long.
-    if (c.count == 2) return changes_of_several<2>(c, v, change);
-    if (c.count == 3) return changes_of_several<3>(c, v, change);
+  const int only = sticky >= 0 ? sticky : 0;
+  if (!(moved >> only & 1)) return;
+  const Constraint<T, D>& surface = c.e[only];
+  const Vector<T, D> u = v + T(-1) * surface.velocity;
+  MPM_LOOP for (int axis = 0; axis < D; axis++) {
+    // Row by row, as the adjoint has it.
+    MPM_UNROLL for (int i = 0; i < D; i++) {
+      Vector<T, D> unit;
+      MPM_UNROLL for (int j = 0; j < D; j++)
+        unit[j] = T(i == j);
+      const Vector<T, D> kept = contact_adjoint(surface.kind, u, surface.normal, surface.friction, unit);
+      T own = T(0);
+      MPM_UNROLL for (int j = 0; j < D; j++)
+        own = j == axis ? unit[j] - kept[j] : own;
+      slope[only][i] = own;
+    }
+    f(axis, slope);
   }
-  changes_of_several<0>(c, v, change);
 }
 
 // The velocity v after all of them.
