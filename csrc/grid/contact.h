@@ -1,6 +1,6 @@
 #pragma once
 
-#include "grid/solid.h"
+#include "grid/meridian.h"
 
 // Contact of nodes with the obstacles of their scene: velocities after it, impulses, and adjoints.
 namespace mpm {
@@ -175,15 +175,30 @@ MPM_HD int obstacle_around(bool wanted, const Poses& poses, const Vector<T, D>& 
 template <class Poses, class T, int D>
 MPM_HD void find_in_solid(const Poses& poses, int inside, NodeContact<T, D>& c) {
   const auto& a = poses.a;
-  SolidAt<Poses, T, D> solid(poses, c.position);
-  solid.find(inside >= 0);
-  const auto& foot = solid.foot();
-  MPM_LOOP for (int i = 0; i < foot.count; i++) {
-    const auto& face = solid.face(i);
-    const bool frozen = face.flat && a.kind[face.obstacle].shape == ObstacleShape::sampled;
-    c.add(face.obstacle, face.face, frozen ? face.at : c.position);
+  int in_space = inside;
+  if constexpr (D == 3) {
+    Vector<T, 2> place = zero_vector<T, 2>();
+    const bool in_plane = is_in_meridian(poses, inside, c.position, place);
+    if (any_of_warp(in_plane)) {
+      int count = 0, face[D];
+      find_in_meridian(in_plane, a, inside, place, count, face);
+      join_warp();
+      MPM_LOOP for (int i = 0; i < count; i++)
+        c.add(inside, face[i], c.position);
+    }
+    if (in_plane) in_space = -1;
   }
-  if (inside >= 0 && foot.count == 0) c.add(inside, -1, c.position);  // deep inside
+  if (any_of_warp(in_space >= 0)) {
+    SolidAt<Poses, T, D> solid(poses, c.position);
+    solid.find(in_space >= 0);
+    const auto& foot = solid.foot();
+    MPM_LOOP for (int i = 0; i < foot.count; i++) {
+      const auto& face = solid.face(i);
+      const bool frozen = face.flat && a.kind[face.obstacle].shape == ObstacleShape::sampled;
+      c.add(face.obstacle, face.face, frozen ? face.at : c.position);
+    }
+  }
+  if (inside >= 0 && c.count == 0) c.add(inside, -1, c.position);  // deep inside
 }
 
 template <class Poses, class T, int D>

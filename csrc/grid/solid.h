@@ -38,8 +38,9 @@ struct ContactSlot {
 
 // ---- walls
 
-template <class T, int D>
-MPM_HD T wall_height(const ContactArguments<T, D>& a, int face, const Vector<T, D>& x) {
+// Arguments of contact, or of a plane of space (grid/meridian.h), are a `Space` where either will do.
+template <class Space, class T, int D>
+MPM_HD T wall_height(const Space& a, int face, const Vector<T, D>& x) {
   return face % 2 ? a.wall_plane[face] - x[face / 2] : x[face / 2] - a.wall_plane[face];
 }
 
@@ -62,8 +63,8 @@ MPM_HD Vector<T, D> within_walls(const ContactArguments<T, D>& a, Vector<T, D> x
   return x;
 }
 
-template <class T, int D>
-MPM_HD T nearest_wall(const ContactArguments<T, D>& a, const Vector<T, D>& x) {
+template <class Space, class T, int D>
+MPM_HD T nearest_wall(const Space& a, const Vector<T, D>& x) {
   T nearest = std::numeric_limits<T>::max();
   MPM_UNROLL for (int face = 0; face < 2 * D; face++) {
     const T height = wall_height(a, face, x);
@@ -282,14 +283,15 @@ struct Foot {
 };
 
 // A depth in steps of 1e-4 cells, so that rounding does not distinguish equal depths.
-template <class T, int D>
-MPM_HD T rounded_depth(const ContactArguments<T, D>& a, const T& depth) {
+template <class Space, class T>
+MPM_HD T rounded_depth(const Space& a, const T& depth) {
   return std::floor(depth * (T(1e4) * a.geometry.inverse_dx) + T(0.5));
 }
 
 // `kSeam` as a length [m], at least some roundings.
-template <class T, int D>
-MPM_HD T seam_of(const ContactArguments<T, D>& a) {
+template <class Space>
+MPM_HD auto seam_of(const Space& a) {
+  using T = std::remove_cvref_t<decltype(a.rounding)>;
   const T seam = T(kSeam * a.dx);
   return seam > 4 * a.rounding ? seam : 4 * a.rounding;
 }
@@ -298,6 +300,7 @@ template <class Poses, class T, int D>
 class SolidAt {
  public:
   using V = Vector<T, D>;
+  using Space = std::remove_cvref_t<decltype(Poses::a)>;
 
   MPM_HD SolidAt(const Poses& poses, const V& node)
       : poses_(poses), a_(poses.a), node_(node), seam_(seam_of(poses.a)), reach_(T(kReach * poses.a.dx)) {}
@@ -716,7 +719,7 @@ class SolidAt {
   }
 
   const Poses& poses_;
-  const ContactArguments<T, D>& a_;
+  const Space& a_;
   const V node_;
   const T seam_, reach_;
   Faces<T, D> faces_;
