@@ -8,8 +8,8 @@ round bodies that the water moves and that move the water. There are 2048 such w
 CPU. An environment step is 0.01 s of all of them, as in Newton's example of a coupled MPM solver. Times are by the wall
 clock over several steps, with one wait for the device.
 
-torch_mpm: `FreeBodies`, water of a finite speed of sound, explicit steps of at most half of the stable time step, one
-native op for a call. The velocities of the bodies are solved for together with the contact of the nodes.
+torch_mpm: `FreeBodies`, water of a finite speed of sound, explicit steps of at most a fraction of the stable time step
+("cfl"), one native op for a call. The velocities of the bodies are solved for together with the contact of the nodes.
 
 Newton (1.8): `SolverCoupledProxy` with `SolverImplicitMPM` and a solver of rigid bodies, as in its example
 `mujoco_mpm_coupled_solver`: one implicit step of incompressible water of at most 50 iterations, four steps of the rigid
@@ -21,6 +21,9 @@ What differs: Newton's water is incompressible and its steps are implicit, so th
 needs a dozen; its kernels are linear and those of torch_mpm quadratic, with 8 and 27 nodes per particle; it solves
 the bodies and the water one after another, torch_mpm together. Bodies meet the water alone, not each other. Particles,
 geometry, masses, joints, gravity, cell width and the time of a step are the same.
+
+The error of a row is how far the mean height of the water, which comes to rest, is above that of incompressible water
+at rest in the cup, in cells.
 """
 
 from __future__ import annotations
@@ -58,6 +61,8 @@ CELLS = 512
 """Active cells of a world for which Newton reserves memory on CUDA; the water has some 130."""
 FRAME = 0.01
 """Time of an environment step [s]."""
+CFL = (0.25, 0.5, 0.9)
+"""Fractions of the stable time step; it is the limit of all rollouts of the stability benchmark."""
 Run = Callable[[int], None]
 
 
@@ -75,7 +80,13 @@ def water() -> torch.Tensor:
     return torch.cartesian_prod(*axes) + corner
 
 
-def of_torch_mpm(worlds: int, device: str) -> tuple[Run, Callable[[], dict[str, float]]]:
+def level() -> float:
+    """Mean height of the water at rest [m]."""
+    volume = math.prod(COUNTS) * SPACING**3
+    return CUP[2] + 0.5 * volume / (math.pi * RADIUS**2)
+
+
+def of_torch_mpm(worlds: int, device: str, cfl: float = 0.5) -> tuple[Run, Callable[[], dict[str, float]]]:
     """Advances by a number of environment steps; heights [m] for a comparison."""
     grid = mpm.Grid(DX, (0.0, 0.0, 0.0), UPPER, scenes=worlds)
     step = mpm.Step(grid, mpm.WeaklyCompressible(bulk_modulus=1e5), (0.0, 0.0, -GRAVITY), "separate")
@@ -91,7 +102,7 @@ def of_torch_mpm(worlds: int, device: str) -> tuple[Run, Callable[[], dict[str, 
     )
     first = [[*place, 1.0, *9 * [0.0]] for place in (CUP, GLASS)]
     rows = torch.tensor([first] * worlds, dtype=torch.float64, device=device)
-    substeps = math.ceil(FRAME / float(step.stable_dt(state).min()))
+    substeps = math.ceil(FRAME / float(step.stable_dt(state, cfl).min()))
     print(f"{substeps} substeps in a step")
     now = [state, rows]
 
@@ -231,12 +242,45 @@ def _newton_solver(model: Any, worlds: int, device: str, rigid: str) -> Any:
 
 
 def text(result: dict[str, Any]) -> str:
-    figures = (
-        "{of}: {worlds} worlds, {ms:.4g} ms per step of all, {rate:.4g} steps/s, after {steps} steps {found}".format(
-            **result
-        )
-    )
-    return f"# Cup and glass beside Newton\n\n{common.describe(result['environment'])}\n\n{figures}\n"
+    rows = [
+        [
+            row["of"],
+            row["cfl"] or "implicit",
+            f"{row['ms']:.4g}",
+            f"{row['rate']:.4g}",
+            row["steps"],
+            f"{row['error']:+.2f}",
+            f"{row['found']['cup']:.6f}",
+        ]
+        for row in result["rows"]
+    ]
+    head = ["of", "cfl", "a step of all [ms]", "steps/s of a world", "after steps", "error [cells]", "cup [m]"]
+    title = f"# Cup and glass beside Newton\n\n{common.describe(result['environment'])}\n\n"
+    return f"{title}{result['worlds']} worlds.\n\n" + common.table(head, rows) + "\n"
+
+
+def measured(made: Callable[[], tuple[Run, Callable[[], dict[str, float]]]], steps: int, cuda: bool) -> dict[str, Any]:
+    """Time of a step [ms], and what is found after the steps."""
+    begin = time.perf_counter()
+    run, found = made()
+
+    def timed() -> float:
+        start = time.perf_counter()
+        run(steps)
+        if cuda:
+            torch.cuda.synchronize()
+        return time.perf_counter() - start
+
+    timed()
+    print(f"{time.perf_counter() - begin:.0f} s to prepare, then {found()}")
+    seconds = min(timed() for _ in range(3))
+    last = found()
+    return {
+        "ms": 1e3 * seconds / steps,
+        "steps": 4 * steps,
+        "error": (last["water"] - level()) / DX,
+        "found": last,
+    }
 
 
 def main() -> None:
@@ -249,34 +293,18 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=20, help="environment steps of a measurement")
     parser.add_argument("--out", type=Path, default=common.RESULTS)
     arguments = parser.parse_args()
-    cuda = arguments.device == "cuda"
+    device, cuda = arguments.device, arguments.device == "cuda"
     worlds = arguments.worlds or (2048 if cuda else 2)
-    begin = time.perf_counter()
-    if arguments.of == "newton":
-        run, found = of_newton(worlds, arguments.device, arguments.rigid)
-    else:
-        run, found = of_torch_mpm(worlds, arguments.device)
+    rows = []
+    for cfl in CFL if arguments.of == "torch_mpm" else (None,):
 
-    def timed() -> float:
-        start = time.perf_counter()
-        run(arguments.steps)
-        if cuda:
-            torch.cuda.synchronize()
-        return time.perf_counter() - start
+        def made(cfl: float | None = cfl) -> tuple[Run, Callable[[], dict[str, float]]]:
+            return of_newton(worlds, device, arguments.rigid) if cfl is None else of_torch_mpm(worlds, device, cfl)
 
-    timed()
-    print(f"{time.perf_counter() - begin:.0f} s to prepare, then {found()}")
-    seconds = min(timed() for _ in range(3))
-    environment = common.environment(arguments.device)
-    result = {
-        "environment": environment,
-        "of": arguments.of,
-        "worlds": worlds,
-        "ms": 1e3 * seconds / arguments.steps,
-        "rate": worlds * arguments.steps / seconds,
-        "steps": 4 * arguments.steps + int(cuda and arguments.of == "newton"),  # one precedes the capture
-        "found": found(),
-    }
+        row = measured(made, arguments.steps, cuda)
+        rows.append({"of": arguments.of, "cfl": cfl, "rate": 1e3 * worlds / row["ms"]} | row)
+    environment = common.environment(device)
+    result = {"environment": environment, "worlds": worlds, "rows": rows}
     print(text(result))
     common.write(arguments.out, f"bodies_{arguments.of}_{common.slug(environment['device'])}", result, text(result))
 

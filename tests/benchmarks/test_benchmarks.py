@@ -59,12 +59,11 @@ def test_water_stays_in_a_cup(of: str) -> None:
     """At the level of its volume within a cell, in torch_mpm; Newton's water is denser in so few cells."""
     if of == "newton":
         pytest.importorskip("newton")
-    water = bodies_newton.COUNTS[0] * bodies_newton.COUNTS[1] * bodies_newton.COUNTS[2] * bodies_newton.SPACING**3
-    level = bodies_newton.CUP[2] + 0.5 * water / (math.pi * bodies_newton.RADIUS**2)
-    run, found = bodies_newton.of_newton(2, "cpu", "xpbd") if of == "newton" else bodies_newton.of_torch_mpm(2, "cpu")
+    made = bodies_newton.of_newton(2, "cpu", "xpbd") if of == "newton" else bodies_newton.of_torch_mpm(2, "cpu", 0.9)
+    run, found = made
     run(40)
-    least = level - (0.5 if of == "torch_mpm" else 1.5) * bodies_newton.DX
-    assert least < found()["water"] < level + 0.5 * bodies_newton.DX
+    error = (found()["water"] - bodies_newton.level()) / bodies_newton.DX
+    assert (-0.5 if of == "torch_mpm" else -1.5) < error < 0.5
     assert found()["cup"] == pytest.approx(0.5, abs=1e-3)
 
 
