@@ -27,6 +27,16 @@ struct BodyNode {
   MetSurfaces<T, D> met;   // faces of obstacles come first, at most D
 };
 
+// Without the places of surfaces that it does not have.
+template <class T, int D>
+MPM_HD void copy_node(const BodyNode<T, D>& from, BodyNode<T, D>& to) {
+  to.node = from.node, to.lattice = from.lattice, to.position = from.position;
+  to.met.any = from.met.any, to.met.sign = from.met.sign;
+  to.met.constraints.count = from.met.constraints.count;
+  MPM_LOOP for (int i = 0; i < from.met.constraints.count; i++)
+    to.met.constraints.e[i] = from.met.constraints.e[i];
+}
+
 // The bodies that a node meets, and its impulses on them. The faces of a body have one velocity at a node, so they
 // count together. What walls give beside obstacles counts as that of the first face.
 template <class T, int D>

@@ -277,7 +277,7 @@ struct BlockTeam {
     const bool keeps = add_lone(single, entry, only.owner, only.normal) || (meets && !single);
     const int at = place(keeps, count);
     if (keeps) list[at] = entry;
-    if (keeps && at < room) nodes[at] = node;
+    if (keeps && at < room) copy_node(node, nodes[at]);
   }
 
   __device__ __noinline__ void find_touch_of(bool wanted, int entry, NodeTouch<T, D>& touch) const {
@@ -323,7 +323,7 @@ struct BlockTeam {
     mass = T(0);
     v = zero_vector<T, D>();
     if (!wanted) return;
-    if (!searches) node = nodes[i];
+    if (!searches) copy_node(nodes[i], node);
     set_surface_velocities(memory.poses, node);
     mass = a.contact.mass[node.node * a.contact.mass_stride];
     v = load_node<T, D>(a.velocity, a.stride, node.node);
