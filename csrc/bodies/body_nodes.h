@@ -37,22 +37,28 @@ MPM_HD void copy_node(const BodyNode<T, D>& from, BodyNode<T, D>& to) {
     to.met.constraints.e[i] = from.met.constraints.e[i];
 }
 
-// The bodies that a node meets, and its impulses on them. The faces of a body have one velocity at a node, so they
-// count together. What walls give beside obstacles counts as that of the first face.
-template <class T, int D>
-struct NodePush {
-  int bodies = 0;
-  int body[D];
-  unsigned numbers = 0;            // of the bodies of the surfaces, two bits each
-  Vector<double, D> at, position;  // [m]
-  Vector<double, D> impulse[D];    // by body [N s]
+// The bodies that a node meets, at most D, and their numbers by surface. The faces of a body have one velocity at a
+// node, so they count together. What walls give beside obstacles counts as that of the first face.
+struct MetBodies {
+  static_assert(kMaxObstacles <= 256);
+  int count = 0;
+  unsigned bodies = 0;   // eight bits each
+  unsigned numbers = 0;  // two bits each
 
+  MPM_HD int operator[](int number) const { return int(bodies >> 8 * number & 255); }
   MPM_HD int number_of(int surface) const { return int(numbers >> 2 * surface & 3); }
+  MPM_HD void add(int surface, int body) {
+    int number = 0;
+    MPM_LOOP while (number < count && (*this)[number] != body)
+      number++;
+    if (number == count) bodies |= unsigned(body) << 8 * count++;
+    numbers |= unsigned(number) << 2 * surface;
+  }
 };
 
 // Derivatives of the impulses of a node on each body by the velocity of one of them.
 template <class T, int D>
-struct PushSlopes {
+struct ImpulseSlopes {
   Matrix<T, D> of[D];
 };
 
@@ -157,23 +163,14 @@ MPM_HD void set_surface_velocities(const ObstaclePose<T, D>* poses, BodyNode<T, 
     if (c.e[i].owner >= 0) c.e[i].velocity = velocity_at(poses[c.e[i].owner], node.position);
 }
 
-// Sets the bodies that a node meets, the owners of its obstacles, and where it is.
+// The owners of the obstacles that a node meets.
 template <class T, int D>
-MPM_HD void set_bodies(const ContactArguments<T, D>& a, const int* owner, const BodyNode<T, D>& node,
-                       NodePush<T, D>& push) {
+MPM_HD MetBodies bodies_of(const int* owner, const BodyNode<T, D>& node) {
   const Constraints<T, D>& c = node.met.constraints;
-  push.bodies = 0, push.numbers = 0;
-  MPM_LOOP for (int i = 0; i < c.count; i++) {
-    if (c.e[i].owner < 0) continue;
-    const int k = owner[c.e[i].owner];
-    int number = 0;
-    MPM_LOOP while (number < push.bodies && push.body[number] != k)
-      number++;
-    if (number == push.bodies) push.body[push.bodies++] = k;
-    push.numbers |= unsigned(number) << 2 * i;
-  }
-  push.at = place_of(a, node.lattice);
-  push.position = as_double(node.position);
+  MetBodies met;
+  MPM_LOOP for (int i = 0; i < c.count; i++)
+    if (c.e[i].owner >= 0) met.add(i, owner[c.e[i].owner]);
+  return met;
 }
 
 // The velocities that the surfaces take from a node.
@@ -183,15 +180,14 @@ MPM_HD_CALL void take_from_node(bool wanted, const BodyNode<T, D>& node, const V
   if (wanted) take_velocities(node.met.constraints, node.met.sign, v, taken);
 }
 
-// Sets the impulses of a node by its mass.
+// The impulse of a node on one of its bodies.
 template <class T, int D>
-MPM_HD void set_impulses(const T& mass, const TakenVelocities<T, D>& taken, NodePush<T, D>& push) {
-  MPM_UNROLL for (int k = 0; k < D; k++)
-    push.impulse[k] = zero_vector<double, D>();
-  MPM_LOOP for (int i = 0; i < taken.count; i++) {
-    Vector<double, D>& impulse = push.impulse[push.number_of(i)];
-    impulse = impulse + as_double(mass * taken.taken[i]);
-  }
+MPM_HD Vector<double, D> impulse_on(int number, const MetBodies& bodies, const T& mass,
+                                    const TakenVelocities<T, D>& taken) {
+  Vector<double, D> impulse = zero_vector<double, D>();
+  MPM_LOOP for (int i = 0; i < taken.count; i++)
+    if (bodies.number_of(i) == number) impulse = impulse + as_double(mass * taken.taken[i]);
+  return impulse;
 }
 
 // The velocity v of a node after contact.
@@ -205,16 +201,17 @@ MPM_HD Vector<T, D> without(const TakenVelocities<T, D>& taken, Vector<T, D> v) 
 // Sets the derivatives of the impulses of a node by the velocity of one of its bodies.
 template <class T, int D>
 MPM_HD_CALL void set_slopes(bool wanted, const BodyNode<T, D>& node, const T& mass, const Vector<T, D>& v,
-                            const NodePush<T, D>& push, int by, PushSlopes<T, D>& slopes) {
+                            const MetBodies& bodies, int by, ImpulseSlopes<T, D>& slopes) {
   if (!wanted) return;
   const Constraints<T, D>& c = node.met.constraints;
   unsigned moved = 0;
   MPM_LOOP for (int i = 0; i < c.count; i++)
-    moved |= unsigned(c.e[i].owner >= 0 && push.number_of(i) == by) << i;
-  slopes = {};
+    moved |= unsigned(c.e[i].owner >= 0 && bodies.number_of(i) == by) << i;
+  MPM_LOOP for (int number = 0; number < bodies.count; number++)
+    slopes.of[number] = zero_matrix<T, D>();
   slopes_of_constraints(c, reflected(node.met.sign, v), moved, [&](int axis, const auto& change) {
     MPM_LOOP for (int i = 0; i < c.count; i++) {
-      Matrix<T, D>& own = slopes.of[push.number_of(i)];
+      Matrix<T, D>& own = slopes.of[bodies.number_of(i)];
       MPM_UNROLL for (int j = 0; j < D; j++)
         own[j][axis] -= mass * node.met.sign[j] * change[i][j];
     }
@@ -260,7 +257,7 @@ MPM_HD void set_slope_block(const Slope& slope, const Vector<T, D>& at, const Ve
 
 // Of one body of a node, by the velocity of one of them, for `set_slope_block`.
 template <class T, int D>
-MPM_HD auto slope_of(const PushSlopes<T, D>& slopes, int number) {
+MPM_HD auto slope_of(const ImpulseSlopes<T, D>& slopes, int number) {
   return [&slopes, number](int axis) {
     Vector<T, D> row;
     MPM_UNROLL for (int i = 0; i < D; i++)

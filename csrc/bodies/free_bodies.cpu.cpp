@@ -48,10 +48,9 @@ struct OneThread {
       if (slopes) add_slopes([&](int axis) { return contact.slope(axis); }, arm, arm, k, k, slopes);
     }
     each_other(scene, [&](const BodyNode<T, D>& node, const T& mass, const Vector<T, D>& v) {
-      NodePush<T, D> push{};
-      set_bodies(a.contact, a.owner, node, push);
-      if (impulses) add_impulses(scene, node, mass, v, push, impulses);
-      for (int by = 0; slopes && by < push.bodies; by++) add_slopes_by(scene, node, mass, v, push, by, slopes);
+      const MetBodies bodies = bodies_of(a.owner, node);
+      if (impulses) add_impulses(scene, node, mass, v, bodies, impulses);
+      for (int by = 0; slopes && by < bodies.count; by++) add_slopes_by(scene, node, mass, v, bodies, by, slopes);
     });
   }
 
@@ -86,27 +85,28 @@ struct OneThread {
 
   template <class Scene>
   void add_impulses(const Scene& scene, const BodyNode<T, D>& node, const T& mass, const Vector<T, D>& v,
-                    NodePush<T, D>& push, double* sums) const {
+                    const MetBodies& bodies, double* sums) const {
     TakenVelocities<T, D> taken;
     take_from_node(true, node, v, taken);
-    set_impulses(mass, taken, push);
-    for (int number = 0; number < push.bodies; number++) {
-      const int k = push.body[number];
-      add_impulse(arm_from(scene.now[k], push.at), push.impulse[number], sums + k * n);
+    const Vector<double, D> at = place_of(a.contact, node.lattice);
+    for (int number = 0; number < bodies.count; number++) {
+      const int k = bodies[number];
+      add_impulse(arm_from(scene.now[k], at), impulse_on(number, bodies, mass, taken), sums + k * n);
     }
   }
 
   // Derivatives of the impulses on all bodies by the velocity of one.
   template <class Scene>
   void add_slopes_by(const Scene& scene, const BodyNode<T, D>& node, const T& mass, const Vector<T, D>& v,
-                     const NodePush<T, D>& push, int by, double* sums) const {
-    PushSlopes<T, D> slopes;
-    set_slopes(true, node, mass, v, push, by, slopes);
-    const int l = push.body[by];
-    for (int number = 0; number < push.bodies; number++) {
-      const int k = push.body[number];
-      add_slopes(slope_of(slopes, number), rounded_arm_from<T>(scene.now[k], push.at),
-                 rounded_arm_from<T>(scene.now[l], push.position), k, l, sums);
+                     const MetBodies& bodies, int by, double* sums) const {
+    ImpulseSlopes<T, D> slopes;
+    set_slopes(true, node, mass, v, bodies, by, slopes);
+    const Vector<double, D> at = place_of(a.contact, node.lattice);
+    const int l = bodies[by];
+    for (int number = 0; number < bodies.count; number++) {
+      const int k = bodies[number];
+      add_slopes(slope_of(slopes, number), rounded_arm_from<T>(scene.now[k], at),
+                 rounded_arm_from<T>(scene.now[l], as_double(node.position)), k, l, sums);
     }
   }
 

@@ -384,10 +384,7 @@ struct BlockTeam {
   }
 
   // A pair of bodies as a key of sums; negative where a body is.
-  __device__ static int pair_of(int k, int l) {
-    static_assert(kMaxObstacles <= 256);
-    return k < 0 ? -1 : k << 8 | l;
-  }
+  __device__ static int pair_of(int k, int l) { return k < 0 ? -1 : k << 8 | l; }
 
   template <class Impulses, class Slopes>
   __device__ void add_lone_node(int i, bool wants_impulses, Impulses& impulses, bool wants_slopes,
@@ -412,30 +409,31 @@ struct BlockTeam {
   __device__ void add_node(int i, bool wants_impulses, Impulses& impulses, bool wants_slopes, Slopes& slopes) const {
     const bool wanted = i < count;
     BodyNode<T, D> node;
-    NodePush<T, D> push;
+    MetBodies bodies;
     T mass;
     Vector<T, D> v;
     load(wanted, i, node, mass, v);
-    if (wanted) set_bodies(a.contact, a.owner, node, push);
-    if (wants_impulses) add_impulses(wanted, node, mass, v, push, impulses);
-    MPM_LOOP for (int by = 0; wants_slopes && any_of_warp(by < push.bodies); by++)
-      add_slopes_by(by < push.bodies, node, mass, v, push, by, slopes);
+    if (wanted) bodies = bodies_of(a.owner, node);
+    if (wants_impulses) add_impulses(wanted, node, mass, v, bodies, impulses);
+    MPM_LOOP for (int by = 0; wants_slopes && any_of_warp(by < bodies.count); by++)
+      add_slopes_by(by < bodies.count, node, mass, v, bodies, by, slopes);
   }
 
   // Impulses of a node on its bodies.
   template <class Sums>
   __device__ void add_impulses(bool wanted, const BodyNode<T, D>& node, const T& mass, const Vector<T, D>& v,
-                               NodePush<T, D>& push, Sums& sums) const {
+                               const MetBodies& bodies, Sums& sums) const {
     TakenVelocities<T, D> taken;
     if (any_of_warp(wanted)) {
       take_from_node(wanted, node, v, taken);
       join_warp();
     }
-    if (wanted) set_impulses(mass, taken, push);
-    MPM_LOOP for (int number = 0; any_of_warp(number < push.bodies); number++) {
-      const int k = number < push.bodies ? push.body[number] : -1;
+    MPM_LOOP for (int number = 0; any_of_warp(number < bodies.count); number++) {
+      const int k = number < bodies.count ? bodies[number] : -1;
       double along[n];
-      if (k >= 0) set_along_motions(arm_from(memory.now[k], push.at), push.impulse[number], along);
+      if (k >= 0)
+        set_along_motions(arm_from(memory.now[k], place_of(a.contact, node.lattice)),
+                          impulse_on(number, bodies, mass, taken), along);
       sums.add(k, along);
     }
   }
@@ -443,19 +441,19 @@ struct BlockTeam {
   // Derivatives of the impulses of a node on its bodies by the velocity of one of these.
   template <class Sums>
   __device__ void add_slopes_by(bool acts, const BodyNode<T, D>& node, const T& mass, const Vector<T, D>& v,
-                                const NodePush<T, D>& push, int by, Sums& sums) const {
-    PushSlopes<T, D> slopes;
+                                const MetBodies& bodies, int by, Sums& sums) const {
+    ImpulseSlopes<T, D> slopes;
     if (any_of_warp(acts)) {
-      set_slopes(acts, node, mass, v, push, by, slopes);
+      set_slopes(acts, node, mass, v, bodies, by, slopes);
       join_warp();
     }
-    const int l = acts ? push.body[by] : -1;
-    MPM_LOOP for (int number = 0; any_of_warp(acts && number < push.bodies); number++) {
-      const int k = acts && number < push.bodies ? push.body[number] : -1;
+    const int l = acts ? bodies[by] : -1;
+    MPM_LOOP for (int number = 0; any_of_warp(acts && number < bodies.count); number++) {
+      const int k = acts && number < bodies.count ? bodies[number] : -1;
       T block[n * n];
       if (k >= 0)
-        set_slope_block(slope_of(slopes, number), rounded_arm_from<T>(memory.now[k], push.at),
-                        rounded_arm_from<T>(memory.now[l], push.position), block);
+        set_slope_block(slope_of(slopes, number), rounded_arm_from<T>(memory.now[k], place_of(a.contact, node.lattice)),
+                        rounded_arm_from<T>(memory.now[l], as_double(node.position)), block);
       sums.add(pair_of(k, l), block);
     }
   }

@@ -12,11 +12,16 @@ inline namespace TORCH_MPM_ISA {
 template <class T>
 struct MeridianPose : ObstaclePose<T, 2> {};
 
+// Points beyond the axis see what their mirror images see.
 template <class T>
 MPM_HD T face_height(const MeridianPose<T>& o, int face, const Vector<T, 2>& body, Vector<T, 2>& normal, T& beyond) {
   beyond = T(0);
-  if (face < 0) return RevolvedShape::surface(o, body, normal, static_cast<T*>(nullptr));
-  return RevolvedShape::face_height(o, face, body, normal, beyond);
+  if (face >= 0) return RevolvedShape::face_height(o, face, body, normal, beyond);
+  const bool mirrored = body[0] < T(0);
+  const T height =
+      polygon_surface(o.data, o.numbers / 2, Vector<T, 2>{{abs(body[0]), body[1]}}, normal, static_cast<T*>(nullptr));
+  if (mirrored) normal[0] = T(0) - normal[0];
+  return height;
 }
 
 template <class T>
@@ -68,12 +73,14 @@ class MeridianPoses {
   MeridianPose<T> pose_;
 };
 
-// Whether obstacle `inside` is such a body, and the place of a node in its plane. A node on the axis has many planes.
+// Whether obstacle `inside` is such a body, with no wall that a foot of the node may be at, and the place of the node in
+// its plane. A node on the axis has many planes.
 template <class Poses, class T>
 MPM_HD bool is_in_meridian(const Poses& poses, int inside, const Vector<T, 3>& x, Vector<T, 2>& place) {
+  const auto& a = poses.a;
   const auto& s = poses.s;
-  if (inside < 0 || s.walled || s.near != uint64_t(1) << inside) return false;
-  if (poses.a.kind[inside].shape != ObstacleShape::revolved) return false;
+  if (inside < 0 || s.near != uint64_t(1) << inside || a.kind[inside].shape != ObstacleShape::revolved) return false;
+  if (s.walled && !(nearest_wall(a, x) > T(kReach * a.dx) + 2 * seam_of(a))) return false;
   const auto& pose = poses[inside];
   place = AroundAxis<T, 3>(extent_of(pose), to_body(pose, x)).point;
   return place[0] > T(0);

@@ -104,13 +104,15 @@ struct NearestEdge {
 template <class T>
 MPM_HD T gap_of_edges(const T* corner, int corners, const Vector<T, 2>& p, int nearest, const Vector<T, 2>& offset) {
   const Vector<T, 2> foot = p + T(-1) * offset;
-  const T lowest = T(-1.001) * length(offset);
+  const T deepest = T(1.001 * 1.001) * dot(offset, offset);  // all of these are squares
   T gap = std::numeric_limits<T>::max();
   const auto add = [&](int k, const Vector<T, 2>& point, const Vector<T, 2>& foot) {
-    T way = length(offset_from_edge(corner + 2 * k, end_of_edge(corner, corners, k), foot)), beyond;
-    Vector<T, 2> normal;
-    const T height = edge_height(corner, corners, k, point, normal, beyond);
-    if (height >= lowest && height < way) way = height > T(0) ? height : T(0);
+    const T *const a = corner + 2 * k, *const b = end_of_edge(corner, corners, k);
+    const Vector<T, 2> away = offset_from_edge(a, b, foot), edge = {{b[0] - a[0], b[1] - a[1]}};
+    T way = dot(away, away);
+    const T size = dot(edge, edge), side = (point[0] - a[0]) * edge[1] - (point[1] - a[1]) * edge[0];
+    if (side > T(0) ? side * side < way * size : size > T(0) && side * side <= deepest * size)
+      way = side > T(0) ? side * side / size : T(0);
     if (way < gap) gap = way;
   };
   for (int k = 0; k < corners; k++) {
@@ -118,7 +120,7 @@ MPM_HD T gap_of_edges(const T* corner, int corners, const Vector<T, 2>& p, int n
     if (k != nearest && !is_on_axis(a, b)) add(k, p, foot);
     if (leads_to_tip(a, b)) add(k, across_axis(p), across_axis(foot));
   }
-  return gap;
+  return sqrt(gap);
 }
 
 // Distance of the edges beyond tips from a point.

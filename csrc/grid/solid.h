@@ -249,9 +249,9 @@ struct Face {
   int obstacle, face;
   bool flat;
   Vector<T, D> at, normal;
-  T height, depth;        // of `at`; of the node
-  bool is_plane = false;  // that a point beside a shape sees, see `add_plane`
-  T rounded = T(0);       // depth
+  T height, depth;  // of `at`; of the node
+  bool is_plane;    // that a point beside a shape sees, see `add_plane`
+  T rounded;        // depth
 };
 
 // Sets what a point sees of a face, whose numbers and point `at` are given.
