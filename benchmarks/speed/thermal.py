@@ -206,9 +206,7 @@ def until_a_time(s: Setup, device: str, samples: int) -> dict[str, Any]:
     return row | {"fixed": fixed} | {name: best / fixed[other] for name, other in ratios.items()}
 
 
-def with_fixed_dt(
-    step: mpm.Step, state: mpm.State, n: int, dt: float, device: str, samples: int
-) -> dict[str, Any]:
+def with_fixed_dt(step: mpm.Step, state: mpm.State, n: int, dt: float, device: str, samples: int) -> dict[str, Any]:
     """Seconds of a substep of fixed dt in one call by the fastest schedule, in one call by the schedule of a segment of
     `torch_mpm.rollout_to`, and in calls of that schedule as long as a segment; and both schedules."""
     fastest = mpm.plan_rollout(step, state, n, dt).schedule
