@@ -106,7 +106,7 @@ def _rollouts() -> dict[str, Callable[[], Call]]:
         bodies = mpm.bodies.FreeBodies(mpm.Step(grid, w.law), [body], gravity=(0.0, -1.0))
         rows = torch.zeros(grid.scenes, 1, 6, dtype=torch.float64)
         return _limited(bodies.advance), dict(
-            state=state, bodies=rows, n=2, dt=1e-4, wrenches=torch.ones_like(rows[..., 3:])
+            state=state, bodies=rows, n=2, dt=1e-4, wrenches=torch.ones_like(rows[..., 3:]), checkpoint=1
         )
 
     def method(name: str, /, **given: Any) -> Callable[[], Call]:

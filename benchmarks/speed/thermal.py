@@ -6,8 +6,8 @@
 
 The cube of `benchmarks/speed/work.py`, 3-D, float32, one call of `torch_mpm.rollout`; each row beside another of the
 same run. Heat has a diffusion number of `work.DIFFUSION`. `until a time` is `torch_mpm.rollout_to` beside the same
-substeps of fixed length. `forward and backward` is a loss and its gradients beside the same substeps without
-gradients. Warp takes substeps with heat of the same cube (`heat_peer_warp.py`), on CPUs by one thread,
+substeps of fixed length (see `UNTIL_A_TIME`). `forward and backward` is a loss and its gradients beside the same
+substeps without gradients. Warp takes substeps with heat of the same cube (`heat_peer_warp.py`), on CPUs by one thread,
 where it is installed (`pip install torch-mpm[bench]`). The sizes of the libraries are those of their files. On CUDA
 each kernel of a substep with heat stands beside the limits of the memory and of the arithmetic (`heat_kernels.py`).
 """
@@ -24,6 +24,7 @@ import torch
 
 import torch_mpm as mpm
 from torch_mpm import _library
+from torch_mpm.rollouts.until_time import SEGMENT
 
 from .. import common, regressions
 from . import heat_kernels, memory, peers, rollouts, work
@@ -43,6 +44,17 @@ DIFFUSION = 1e-4
 """κ dt / (ρ c dx²) of heat."""
 MOST_SUBSTEPS = 4096
 """Of a call `until a time`."""
+UNTIL_A_TIME = (
+    f"`until a time` chooses dt on the device before every {SEGMENT} substeps, which are one call of the fused op.\n"
+    "It stands beside substeps of fixed dt: `times` is the ratio to one call of all of them by the fastest schedule, "
+    "`of its schedule` to one call by the schedule of `until a time`, and `of its calls` to calls of that schedule of "
+    f"{SEGMENT} substeps each.\n"
+    "The latter two differ by the cost of calls: each has its own activation, and a schedule that computes G2P and the "
+    "next P2G in one pass computes the first P2G and the last G2P of a call apart, as the next dt follows from the "
+    "particles between them.\n"
+    "The rest is the cost of the limit of the particles and of the choice."
+)
+"""Meaning of the rows `until a time`."""
 EXPANSION, LATENT_HEAT = 1e-4, 2e4
 """[1/K], [J/kg]."""
 SOFTENING = ((0.0, 5.0, 10.0), (1.2e5, 1e5, 4e4))
@@ -178,7 +190,7 @@ def library_sizes() -> dict[str, int]:
 
 
 def until_a_time(s: Setup, device: str, samples: int) -> dict[str, Any]:
-    """Substeps whose length follows the limit, beside substeps of their mean length."""
+    """Substeps whose length follows the limit, beside substeps of their mean length (`UNTIL_A_TIME`)."""
     state, scenes = s.state.sorted(s.step.grid), s.step.grid.scenes
     with torch.no_grad():
         dt = float(s.step.stable_dt(state).min()) / 2
@@ -187,15 +199,31 @@ def until_a_time(s: Setup, device: str, samples: int) -> dict[str, Any]:
         result = mpm.rollout_to(s.step, state, end)
         substeps = int(result.substeps.max())
         best = rollouts.least(device, lambda: mpm.rollout_to(s.step, state, end), samples) / substeps
-        fixed = rollouts.least(device, lambda: mpm.rollout(s.step, state, substeps, end / substeps), samples) / substeps
-    row = {
-        "name": named("until a time", scenes),
-        "particles": len(state),
-        "steps": substeps,
-        "us": best * 1e6,
-        "rate": len(state) / best,
-    }
-    return {**row, "beside": f"fixed dt, {fixed * 1e6:.3g} us", "times": best / fixed}
+        fixed = with_fixed_dt(s.step, state, substeps, end / substeps, device, samples)
+    row = {"name": named("until a time", scenes), "particles": len(state), "steps": substeps, "us": best * 1e6}
+    row |= {"rate": len(state) / best, "beside": f"fixed dt, {fixed['fastest'] * 1e6:.3g} us"}
+    ratios = {"times": "fastest", "of_schedule": "alike", "of_calls": "calls"}
+    return row | {"fixed": fixed} | {name: best / fixed[other] for name, other in ratios.items()}
+
+
+def with_fixed_dt(step: mpm.Step, state: mpm.State, n: int, dt: float, device: str, samples: int) -> dict[str, Any]:
+    """Seconds of a substep of fixed dt in one call by the fastest schedule, in one call by the schedule of a segment of
+    `torch_mpm.rollout_to`, and in calls of that schedule as long as a segment; and both schedules."""
+    fastest = mpm.plan_rollout(step, state, n, dt).schedule
+    own = mpm.plan_rollout(step, state, SEGMENT, torch.full((step.grid.scenes,), dt).to(state.x)).schedule
+
+    def spent(schedule: str | None, most: int) -> float:
+        def rolled() -> mpm.State:
+            now = state
+            for first in range(0, n, most):
+                now = mpm.rollout(step, now, min(most, n - first), dt, schedule=schedule)
+            return now
+
+        return rollouts.least(device, rolled, samples) / n
+
+    best = spent(None, n)
+    times = {"fastest": best, "alike": best if own == fastest else spent(own, n), "calls": spent(own, SEGMENT)}
+    return {**times, "schedule": fastest, "own_schedule": own}
 
 
 def measure(device: str, quick: bool = False) -> dict[str, Any]:
@@ -240,11 +268,21 @@ def table(result: dict[str, Any]) -> str:
         (r["name"], r["particles"], r["us"], r["rate"] * 1e-6, r.get("times", 1.0), r.get("beside", ""))
         for r in result["rows"]
     ]
+    if any("fixed" in r for r in result["rows"]):
+        header = (*header, "of its schedule", "of its calls", "schedule")
+        rows = [(*row, *of_segments(r)) for row, r in zip(rows, result["rows"], strict=True)]
     return common.table(header, rows)
 
 
+def of_segments(row: dict[str, Any]) -> tuple[Any, ...]:
+    """Cells of a row `until a time` beside the same schedule; empty for the others."""
+    return (row["of_schedule"], row["of_calls"], row["fixed"]["own_schedule"]) if "fixed" in row else ("", "", "")
+
+
 def notes(result: dict[str, Any]) -> Iterator[str]:
-    """Sentences on the peer and on the libraries, where the result has them."""
+    """Sentences on the rows, on the peer and on the libraries, where the result has them."""
+    if any("fixed" in r for r in result["rows"]):
+        yield UNTIL_A_TIME
     if by_peer := [r for r in result["rows"] if "residual" in r]:
         iterations, residual = by_peer[0]["iterations"], max(r["residual"] for r in by_peer)
         found = [r["difference"]["temperature"] for r in by_peer if "difference" in r]

@@ -74,6 +74,26 @@ def test_thermal_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     assert all(row["us"] > 0 for row in found["rows"]) and found["libraries"]["libtorch_mpm_cpu.so"] > 1e6
     assert "libtorch_mpm_cpu.so" in thermal.text(found) and "peer" not in thermal.text(found)
     assert "until a time" in report.thermal_speed([found])
+    of_times = [row for row in found["rows"] if row["name"].startswith("until a time")]
+    assert of_times and all(f"| {row['fixed']['own_schedule']} " in thermal.table(found) for row in of_times)
+    assert thermal.UNTIL_A_TIME in thermal.text(found)
+    older = {**found, "rows": [{k: v for k, v in row.items() if k != "fixed"} for row in found["rows"]]}
+    assert "of its schedule" not in thermal.text(older)
+
+
+def test_until_a_time_stands_beside_the_schedule_that_it_has(monkeypatch: pytest.MonkeyPatch, device: str) -> None:
+    """A segment of one substep has another schedule than many substeps on a CPU."""
+    monkeypatch.setattr(rollouts, "SECONDS", 0.001)
+    s = step.setup(work.make(6), device)
+    dt = float(s.step.stable_dt(s.state)) / 2
+    for segment, own in ((thermal.SEGMENT, "sorted_cpu"), (1, "per_step")):
+        monkeypatch.setattr(thermal, "SEGMENT", segment)
+        with torch.no_grad():
+            found = thermal.with_fixed_dt(s.step, s.state, 20, dt, device, 1)
+        assert all(found[name] > 0 for name in ("fastest", "alike", "calls"))
+        if device == "cpu":
+            assert (found["schedule"], found["own_schedule"]) == ("sorted_cpu", own)
+            assert (found["alike"] == found["fastest"]) == (own == "sorted_cpu")
 
 
 @pytest.mark.thorough

@@ -61,8 +61,9 @@ def test_commands_fail_with_the_reasons(tmp_path, capsys, monkeypatch, failed):
     simulated = batch.simulate
 
     def broken(*arguments, **options):
-        recorded, failures = simulated(*arguments, **options)
-        return recorded, [f"particle {k} is not finite" if k < failed else "" for k, _ in enumerate(failures)]
+        found = simulated(*arguments, **options)
+        failures = [f"particle {k} is not finite" if k < failed else "" for k, _ in enumerate(found.failures)]
+        return found._replace(failures=failures)
 
     monkeypatch.setattr(batch, "simulate", broken)
     arguments = ["generate", "set.toml", "-o", str(tmp_path / "set"), "--device", "cpu", "--quiet"]

@@ -1,6 +1,7 @@
 """Generation: the same content from any number of processes and after any kill; what can go wrong on the way."""
 
 import json
+import math
 import os
 import random
 import resource
@@ -26,7 +27,7 @@ from torch_mpm.data.generate import check_samples, generate
 from torch_mpm.data.packing import prepare_scene
 from torch_mpm.data.sampling import content
 from torch_mpm.data.shard import record_path, shard_path
-from torch_mpm.data.shard_simulation import draw, simulate
+from torch_mpm.data.shard_simulation import _of_next, draw, simulate
 from torch_mpm.data.workers import Worker, WorkerError, take_device, worker
 from torch_mpm.errors import DamagedFileError
 from torch_mpm.scene import SceneError
@@ -345,14 +346,14 @@ def test_a_scene_that_explodes_is_recorded_and_leaves_the_others_as_they_are(tmp
     assert good and all("left the grid" in s.failure and s.attempts == 3 for s in bad)
     assert all(decoded(tmp_path)[f"scene_{s.id:07d}"][0] == {} for s in bad)
     built = made.scene(*(content(made, s.id) for s in good)).build("cpu")
-    alone, failures = batch.simulate(built, ["position"], 12, 0.005, 10)
+    alone, failures, _ = batch.simulate(built, ["position"], 12, 0.005, 10)
     assert failures == [""] * len(good)
     for recorded, listed in zip(alone, good, strict=True):
         np.testing.assert_array_equal(recorded.arrays["position"], dataset.scene(listed.id)["position"])
     assert list(verify(tmp_path)) == []
 
 
-def test_a_scene_that_fails_is_tried_again_with_half_of_the_time_step(tmp_path):
+def test_a_scene_that_explodes_is_tried_again_with_half_of_the_time_step(tmp_path):
     made = configuration(material__jelly__E={"choice": [1e4, 1.2e7]}, dt=1e-3, dataset__scenes_per_shard=7)
     generate(made, tmp_path, device="cpu")
     stored = decoded(tmp_path)
@@ -363,6 +364,58 @@ def test_a_scene_that_fails_is_tried_again_with_half_of_the_time_step(tmp_path):
         assert attributes["attempts"] == (2 if stiff[name] else 1), name
         assert attributes["dt"] * attributes["substeps_per_frame"] == pytest.approx(0.005)
         assert attributes["dt"] == pytest.approx(5e-4 if stiff[name] else 1e-3)
+
+
+@pytest.mark.parametrize("attempts", [2, 3])
+def test_a_scene_above_the_limit_is_tried_again_with_the_time_step_that_it_needs(attempts, device):
+    """The time step has 0.8 of the limit there; in a last attempt it is half of the first one."""
+    made = configuration(
+        material__jelly__E={"choice": [1e4, 7e6]}, dt=1e-3, grid__deterministic=True, dataset__attempts=attempts
+    )
+    place = torch.device(device)
+    drawn = draw(made, range(7), place)
+    assert drawn.built is not None
+    first = batch.simulate(drawn.built, ["position"], 12, 0.005, 5)
+    stiff = [o.words["material"]["jelly"]["E"] == 7e6 for o in drawn.outcomes]
+    assert [share > 1 for share in first.shares] == [bool(f) for f in first.failures] == stiff and any(stiff)
+    assert all("above the limit" in f for f in first.failures if f) and max(first.shares) < 1.5
+    drawn = draw(made, range(7), place)
+    simulate(made, drawn, place)
+    needed = math.ceil(5 * max(first.shares) / 0.8)
+    for outcome, again in zip(drawn.outcomes, stiff, strict=True):
+        assert (outcome.attempts, outcome.failure) == (2 if again else 1, "")
+        assert outcome.substeps == (5 if not again else 10 if attempts == 2 else needed) and 5 < needed < 10
+        assert outcome.dt == 0.005 / outcome.substeps
+    built = made.scene(*(o.words for o in drawn.outcomes if o.attempts == 2)).build(place)
+    alone = batch.simulate(built, ["position"], 12, 0.005, 10 if attempts == 2 else needed)
+    assert max(alone.shares) <= 1 and not any(alone.failures)
+    retried = [o for o in drawn.outcomes if o.attempts == 2]
+    for outcome, stored in zip(retried, alone.stored, strict=True):
+        np.testing.assert_array_equal(outcome.arrays["position"], stored.arrays["position"])
+
+
+def test_substeps_of_attempts():
+    """At most twice those before; more than before, as failed scenes have a share above 1."""
+    assert _of_next(77, 154, 1.0001, False) == 97 and _of_next(77, 154, 1.21, False) == 117
+    assert _of_next(77, 154, 1.7, False) == 154 and _of_next(77, 154, math.inf, False) == 154
+    assert _of_next(77, 154, 1.0001, True) == 154 and _of_next(97, 308, 1.2, False) == 146
+
+
+@pytest.mark.parametrize("liquid_modulus", [1e4, 1e7])
+def test_the_time_step_suffices_for_both_phases(liquid_modulus, device):
+    """A liquid that is stiffer than the solid sets the time step before anything has melted."""
+    heat = {"conductivity": 10.0, "specific_heat": 1000.0, "melting_point": 330.0, "latent_heat": 1e3}
+    jelly = {"law": "neo_hookean", "E": 1e5, "nu": 0.3, "density": 1000.0}
+    made = configuration(
+        heat={"reference": 330.0}, body__0__temperature=300.0, body__0__velocity=[0.0, 0.0], gravity=[0.0, 0.0],
+        material={"jelly": jelly | heat | {"liquid": {"bulk_modulus": liquid_modulus}}},
+    )  # fmt: skip
+    built = draw(made, range(2), torch.device(device)).built
+    assert built is not None
+    of_solid = 2 * 0.1 * built.step.stability_report(built.state).rate
+    times = math.sqrt(liquid_modulus / (1e5 / (2 * 1.3 * 0.4)))  # bulk moduli in the plane: K and λ + μ
+    for found, expected in zip(batch.substeps(built, 0.1, 0.5), (max(1.0, times) * of_solid).tolist(), strict=True):
+        assert expected - 0.01 <= found <= expected + 1.01
 
 
 def test_what_is_packed_beside_the_simulation_is_the_same(device):

@@ -32,7 +32,7 @@ def gas(device):
 
 
 def simulate(built):
-    stored, failures = batch.simulate(built, ["position"], FRAMES, INTERVAL, COUNT)
+    stored, failures, _ = batch.simulate(built, ["position"], FRAMES, INTERVAL, COUNT)
     assert failures == ["", ""]
     return [scene.arrays["position"] for scene in stored]
 
@@ -83,7 +83,7 @@ def test_a_pool_that_is_too_small_is_found_on_the_way(late, monkeypatch, device)
         if device == "cpu" and len(frames) == 5:
             late[-1].status[0, Status.PROBLEM_ACTIVATION] = 5
 
-    stored, failures = batch.simulate(gas(device), ["position"], FRAMES, INTERVAL, COUNT, mark)
+    stored, failures, _ = batch.simulate(gas(device), ["position"], FRAMES, INTERVAL, COUNT, mark)
     assert failures == ["", ""] and len(late) == 2 * batch.LOOK + FRAMES - 1
     assert frames == [*range(2 * batch.LOOK), *range(FRAMES)]
     for a, b in zip(stored, expected, strict=True):

@@ -9,6 +9,7 @@ import operator
 
 import numpy as np
 import pytest
+import torch
 
 pytest.importorskip("pydantic")
 
@@ -319,6 +320,27 @@ def test_every_preset_gives_scenes_that_run(name, tmp_path):
     summary = generate(made, tmp_path, device="cpu")
     assert summary["complete"] and summary["failed"] == 0
     assert Configuration.preset(name).words["grid"]["deterministic"]
+
+
+def test_squeezed_wax_of_a_preset_keeps_its_pressure_when_it_melts():
+    """At 0.7 of its volume, for which a piece that lands on the plate is squeezed: pressure and tangent modulus, for
+    both choices of E."""
+    made = Configuration.preset("melting")
+    words = [content(made, k) for k in range(6)]
+    built = made.scene(*words).build("cpu")
+    assert {w["material"]["wax"]["E"] for w in words} == {5e4, 1e5}
+    state, law = built.step.prepare(built.state), built.step.law
+    squeezed = state.replace(
+        F=math.sqrt(0.7) * torch.eye(2).expand_as(state.F), J=torch.full_like(state.mass, 0.7),
+        temperature=torch.zeros_like(state.mass),
+    )  # fmt: skip
+
+    def phase(liquid):
+        part = squeezed.replace(extra={**state.extra, "liquid": torch.full_like(state.mass, liquid)})
+        return -law.stress(part).diagonal(dim1=1, dim2=2).mean(1), law.stiffness(part)
+
+    for solid, liquid in zip(phase(0.0), phase(1.0), strict=True):
+        assert (solid > 0).all() and (liquid / solid).log2().abs().max() < 1
 
 
 def test_an_unknown_preset():

@@ -13,6 +13,7 @@ are stable at the time step of the material.
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -20,6 +21,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from ..boundaries.control import Poses, restored
 from ..boundaries.thickness import warn_of_thin_walls
 from ..cuda_graphs.capture import DeviceConstantCache, is_readable
 from ..errors import FLOATING, SimulationError, check_count, check_number, check_vector, shape_of
@@ -29,11 +31,14 @@ from ..ops.autograd import is_tracked
 from ..ops.contact import MAX_OBSTACLES, fusible, walls_beside
 from ..ops.free_bodies import BodyTables, body_tables
 from ..ops.obstacle_tables import values_without_motion
+from ..rollouts.budget import EVERYTHING, within_budget
+from ..rollouts.checkpoints import Checkpoints, as_checkpoints, from_python, offloaded
 from ..rollouts.facts import wants_gradient
 from ..rollouts.reasons import why_not_fused
 from ..rollouts.run import computed
 from ..rollouts.steps import MovingBodies, Steps
 from ..state.state import State, check_state
+from ..step.status import aside
 from ..step.step import Step
 from . import solution
 from .body import Body, Driven, Joint
@@ -99,7 +104,13 @@ class FreeBodies:
         return len(self.bodies)
 
     def advance(
-        self, state: State, bodies: Tensor, n: int, dt: float, wrenches: Tensor | None = None
+        self,
+        state: State,
+        bodies: Tensor,
+        n: int,
+        dt: float,
+        wrenches: Tensor | None = None,
+        checkpoint: int | Checkpoints | None = None,
     ) -> tuple[State, Tensor]:
         """The material and the bodies n steps later.
 
@@ -111,6 +122,9 @@ class FreeBodies:
             n, dt: number of steps, and time step [s], a number.
             wrenches: forces [N] and torques about the centres of mass [N m] on the bodies beside gravity and the
                 material [B, K, 6] or [B, K, 3]; None for none.
+            checkpoint: states to store for the backward pass, which recomputes the steps in between: a number, for the
+                state of every `checkpoint` steps, or `Checkpoints`, as in `torch_mpm.rollout`. None: all steps are
+                stored. Without effect where no gradient is wanted.
 
         Returns:
             The state, and poses and velocities as `bodies`, float64. What the material loses the bodies gain, to
@@ -133,7 +147,8 @@ class FreeBodies:
             raise ValueError("a step with bodies must have no on_grid of its own")
         rows = bodies.double()
         self._check_joints(rows)
-        state, rows, report = self._advanced(Steps(self.step, n, dt), state, rows, wrenches)
+        steps = Steps(self.step, n, dt, as_checkpoints(checkpoint))
+        state, rows, report = self._advanced(steps, state, rows, wrenches)
         residual = report[:, 1:]
         self.report = BodyReport(report[:, 0], residual, residual <= TOLERANCE[state.x.dtype])
         assign(self.obstacles, self.frames.motion(motion_of(rows.detach(), self.step.grid.dim)), 0.0)
@@ -146,18 +161,43 @@ class FreeBodies:
         moving = self._in_one_op(steps, state, rows, wrenches)
         with steps.call(state) as end_call, steps.control(state) as end_motion:
             if moving is not None:
-                state = end_call(end_motion(computed(steps._replace(bodies=moving), state)))
+                state = end_call(end_motion(computed(steps._replace(bodies=moving, checkpoints=None), state)))
                 return state, moving.rows, moving.report
-            report = rows.new_zeros(len(rows), 1 + len(self))
-            for _ in range(steps.n):
-                hook = _Hook(self, rows, steps.dt, wrenches)
-                self.step.on_grid = hook
-                try:
-                    state = self.step(state, steps.dt)
-                finally:
-                    self.step.on_grid = None
-                rows, report = hook.rows, torch.maximum(report, hook.report)
+            state, rows, report = self._step_by_step(steps, state, rows, wrenches)
             return end_call(end_motion(state)), rows, report
+
+    def _step_by_step(self, steps: Steps, state: State, rows: Tensor, wrenches: Tensor | None) -> _Moved:
+        """The state, rows and report after steps from Python, with the stored states that the gradient wants."""
+
+        def advance(now: _Moved, count: int, first: int) -> _Moved:
+            with restored(self.obstacles):  # The backward pass calls this again, when they are elsewhere.
+                for _ in range(count):
+                    now = self._stepped(now, steps.dt, wrenches)
+            return now
+
+        def alone(given: State, dt: Any) -> State:
+            with aside(self.step, given.x):
+                return advance(start._replace(state=given), 1, 0).state
+
+        start = _Moved(state, rows, rows.new_zeros(len(rows), 1 + len(self)))
+        checkpoints = None
+        if steps.checkpoints is not None and torch.is_grad_enabled():
+            start = start._replace(state=self.step.prepare(self.step.with_residual(state, steps.dt)))
+            checkpoints = within_budget(steps._replace(step=alone), start.state, fused=False)
+        if checkpoints is None or checkpoints is EVERYTHING:
+            return advance(start, steps.n, 0)
+        with offloaded(start.state) if checkpoints.offload else contextlib.nullcontext():
+            return from_python(advance, start, steps.n, checkpoints, self.step)
+
+    def _stepped(self, now: _Moved, dt: Any, wrenches: Tensor | None) -> _Moved:
+        """The material and the bodies a step later."""
+        hook = _Hook(self, now.rows, dt, wrenches)
+        self.step.on_grid = hook
+        try:
+            state = self.step(now.state, dt)
+        finally:
+            self.step.on_grid = None
+        return _Moved(state, hook.rows, torch.maximum(now.report, hook.report))
 
     def _in_one_op(self, steps: Steps, state: State, rows: Tensor, wrenches: Tensor | None) -> MovingBodies | None:
         """The bodies of steps that the fused op computes; None where it does not."""
@@ -248,6 +288,25 @@ class FreeBodies:
         tensors = [rows, table, data, constants, parts, gravity.reshape(-1, self.step.grid.dim), *force]
         limits = solution.MAX_ITERATIONS, TOLERANCE[like.dtype]
         return ([t.detach().contiguous() for t in tensors], *lists, *limits)
+
+
+class _Moved(NamedTuple):
+    """Material and bodies after some steps: the pytree that checkpoints store."""
+
+    state: State
+    rows: Tensor
+    report: Tensor
+
+    @property
+    def x(self) -> Tensor:
+        return self.state.x
+
+    @property
+    def poses(self) -> Poses:
+        return self.state.poses
+
+    def with_poses(self, poses: Poses) -> _Moved:
+        return self._replace(state=self.state.with_poses(poses))
 
 
 class _Hook:

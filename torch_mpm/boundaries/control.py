@@ -250,23 +250,30 @@ def _control_step(step: Any, obstacles: Sequence[Obstacle], state: State, span: 
             obstacle.follow(None, PACE)
 
 
-def motions_of(step: Any, state: State) -> Callable[[], contextlib.AbstractContextManager[None]]:
-    """Factory of a context with the present motions of obstacles in steps from a state, for a backward pass that
-    recomputes these steps."""
-    now = [(o, _Motions(o).stored(o, state.poses)) for o in obstacles_of(step)]
+def motions_of(step: Any, poses: Poses) -> Callable[[], contextlib.AbstractContextManager[None]]:
+    """Factory of a context with the present motions of obstacles in steps from a state with these poses, for a backward
+    pass that recomputes these steps."""
+    now = [(o, _Motions(o).stored(o, poses)) for o in obstacles_of(step)]
 
     @contextlib.contextmanager
     def again() -> Iterator[None]:
-        before = [(o, _Motions(o)) for o, _ in now]
-        for obstacle, motions in now:
-            motions.give(obstacle)
-        try:
-            yield
-        finally:
-            for obstacle, motions in before:
+        with restored([o for o, _ in now]):
+            for obstacle, motions in now:
                 motions.give(obstacle)
+            yield
 
     return again
+
+
+@contextlib.contextmanager
+def restored(obstacles: Sequence[Obstacle]) -> Iterator[None]:
+    """Context after which obstacles have the attributes and the control step that they had before."""
+    before = [(o, _Motions(o)) for o in obstacles]
+    try:
+        yield
+    finally:
+        for obstacle, motions in before:
+            motions.give(obstacle)
 
 
 class _Motions:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,6 +14,7 @@ from ..geometry.values import to_device
 from ..grid.grid import Grid
 from ..grid.topology import Status
 from ..laws import Mixture
+from ..laws.thermal import LIQUID
 from ..rollouts import rollout
 from ..scene import fields, heap
 from ..scene.build import Built
@@ -30,8 +31,21 @@ OnFrame = Callable[[int], None]
 """Function that is called with the number of each frame."""
 
 
+class Simulated(NamedTuple):
+    """Result of a simulation of scenes [B]."""
+
+    stored: list[StoredFrames]
+    """Fields of each scene."""
+    failures: list[str]
+    """Reason of the failure of each scene; "" for a valid one."""
+    shares: list[float]
+    """Largest share of the stability limit that the time step had at a check, above 1 for a failed scene. Infinite
+    where particles were not finite, outside or inverted, or a solve failed."""
+
+
 def substeps(built: Built, interval: float, cfl: float, dt: float | None = None) -> list[float]:
-    """Number of substeps that each scene [B] needs per frame, at the start and at the speed of a fall.
+    """Number of substeps that each scene [B] needs per frame: with the positions at the start, the speed of a fall, and
+    the stiffer of the phases of materials that melt.
 
     Args:
         built: the scenes.
@@ -41,7 +55,8 @@ def substeps(built: Built, interval: float, cfl: float, dt: float | None = None)
     """
     if dt is not None:
         return [math.ceil(interval / dt * (1 - 1e-9))] * built.grid.scenes
-    rates: list[float] = built.step.stability_report(_falling(built)).rate.tolist()
+    reports = [built.step.stability_report(state) for state in _phases(built, _falling(built))]
+    rates: list[float] = torch.stack([report.rate for report in reports]).amax(0).tolist()
     return [max(1.0, math.ceil(interval * rate / cfl * (1 - 1e-9))) if rate < math.inf else rate for rate in rates]
 
 
@@ -61,6 +76,17 @@ def _falling(built: Built) -> State:
     down = rows / strength.clamp_min(1e-30)
     added = down * (2 * (rows.abs() * size).sum(1, keepdim=True)).sqrt()  # v² = 2 g h
     return state.replace(v=state.v + (added[0] if state.scene is None else added[state.scene.long()]))
+
+
+def _phases(built: Built, state: State) -> list[State]:
+    """The state with all particles solid and with all liquid, where materials melt; otherwise the state.
+
+    Tangent modulus and viscosity are between those of the phases.
+    """
+    extra = built.step.prepare(state).extra
+    if LIQUID not in extra:
+        return [state]
+    return [state.replace(extra={**extra, LIQUID: torch.full_like(extra[LIQUID], share)}) for share in (0.0, 1.0)]
 
 
 def particles_of(built: Built) -> list[int]:
@@ -86,7 +112,7 @@ def simulate(
     executor: Executor | None = None,
     packed: Sequence[bool] | None = None,
     behind: Sequence[Mapping[str, Array]] | None = None,
-) -> tuple[list[StoredFrames], list[str]]:
+) -> Simulated:
     """Simulate all scenes of a batch.
 
     Args:
@@ -97,9 +123,6 @@ def simulate(
         count: substeps per frame.
         on_frame: called after each frame has been queued.
         executor, packed, behind: as in `FrameTransfer`.
-
-    Returns:
-        Fields of each scene, and the reason of its failure; "" for a valid scene.
     """
     _leave_room(built)
     while True:
@@ -112,7 +135,7 @@ def simulate(
             transfer.abandon()
             raise
         if reports is not None:
-            return stored, _failures(built, reports, interval / count, frames)
+            return Simulated(stored, *_failures(built, reports, interval / count, frames))
         transfer.abandon()
 
 
@@ -235,18 +258,21 @@ class _PoolWatch:
 # ---- failures
 
 
-def _failures(built: Built, reports: Tensor, dt: float, frames: int) -> list[str]:
-    """Reason of the failure of each scene; "" for a valid one. Waits for the device."""
+def _failures(built: Built, reports: Tensor, dt: float, frames: int) -> tuple[list[str], list[float]]:
+    """Reason of the failure of each scene and its share of the limit, as in `Simulated`. Waits for the device."""
     texts: list[list[str]] = [[] for _ in range(built.grid.scenes)]
     for problem in built.step.failures().problems.values():
         for scene, number in enumerate(problem.count.tolist()):
             if number:
                 texts[scene].append(f"{number} {problem.what}")
+    shares = [math.inf if text else 0.0 for text in texts]
     for look, (rates, _, wrong) in enumerate(reports.tolist()):
         frame = min(look * LOOK, frames - 1)
         for scene, text in enumerate(texts):
+            share = dt * rates[scene]
+            shares[scene] = max(shares[scene], share if share < math.inf and not wrong[scene] else math.inf)
             if not text and wrong[scene]:
                 text.append(f"{wrong[scene]:.0f} particles were not finite, outside or inverted by frame {frame}")
-            elif not text and not dt * rates[scene] <= 1:
+            elif not text and not share <= 1:
                 text.append(f"the time step {dt:.3g} s was above the limit by frame {frame}")
-    return ["; ".join(text) for text in texts]
+    return ["; ".join(text) for text in texts], shares

@@ -100,7 +100,7 @@ class Dataset(schema.Model):
     scenes_per_shard: Annotated[int, Field(ge=1, le=MOST_SHARDS)] = 16
     """scenes of a file, which are simulated together; as many as the device holds are fastest"""
     attempts: Annotated[int, Field(ge=1, le=10)] = 3
-    """how often a scene is tried, each time with half of the time step, before it is recorded as failed"""
+    """how often a scene is tried, each time with a smaller time step, before it is recorded as failed"""
     obstacles: bool = True
     """whether obstacles are in the data as particles of type 3, a layer below their surface that moves with them"""
     particle_type: dict[str, Code] = Field(default_factory=dict)

@@ -6,6 +6,7 @@ All of it depends on the configuration and the ids of the scenes only.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
@@ -26,6 +27,9 @@ from .packing import Compressed
 from .sampling import NoRoom, content
 from .statistics import Motion
 
+AGAIN = 0.8
+"""Share of the largest limit of failed scenes that the time step of their second attempt has: the limit between two
+checks (`batch.LOOK`) may be smaller than at these."""
 OnFrame = Callable[[int, int], None]
 """Function that is called with the number of simulated scenes and the number of the queued frame."""
 
@@ -150,17 +154,30 @@ def simulate(
     dataset, built = configuration.dataset, drawn.built
     if built is None:
         return
-    count, built = _substeps(configuration, drawn, built, device)
-    rest = drawn.alive
+    first, built = _substeps(configuration, drawn, built, device)
+    rest, count = drawn.alive, first
     for attempt in range(dataset.attempts):
         if built is None or not rest:
             return
-        _attempt(configuration, rest, built, count * 2**attempt, on_frame, packers)
+        shares = _attempt(configuration, rest, built, count, on_frame, packers)
+        share = max(shares)
         rest = [o for o in rest if o.failure]
         if rest and attempt + 1 < dataset.attempts:
             for outcome in rest:
                 outcome.failure = ""
             built = _built(configuration, rest, device)
+            count = _of_next(count, first * 2 ** (attempt + 1), share, attempt + 2 == dataset.attempts)
+
+
+def _of_next(count: int, most: int, share: float, is_last: bool) -> int:
+    """Substeps per frame of the next attempt: those that the limit of the failed scenes needs, or `most`, if these
+    are fewer or it is the last attempt.
+
+    Args:
+        count: substeps per frame of the previous attempt, at most half of `most`.
+        share: largest share of the limit that its time step had.
+    """
+    return most if is_last or not share < math.inf else min(math.ceil(count * share / AGAIN), most)
 
 
 def _substeps(
@@ -182,8 +199,8 @@ def _substeps(
 def _attempt(
     configuration: Configuration, outcomes: list[Outcome], built: Built, count: int, on_frame: OnFrame | None,
     packers: Executor | None,
-) -> None:  # fmt: skip
-    """Simulate scenes and store the arrays of valid ones."""
+) -> list[float]:  # fmt: skip
+    """Simulate scenes and store the arrays of valid ones; returns the shares of `batch.Simulated`."""
     dataset, statics = configuration.dataset, built.statics()
     names = ("position", *dataset.fields)
 
@@ -193,7 +210,7 @@ def _attempt(
 
     packed, behind = [packers is not None] * len(outcomes), [o.behind for o in outcomes]
     try:
-        stored, failures = batch.simulate(
+        stored, failures, shares = batch.simulate(
             built, names, dataset.frames, dataset.interval, count, report_frame, packers, packed, behind
         )
     except torch.OutOfMemoryError as error:
@@ -208,6 +225,7 @@ def _attempt(
             rows = slice(ends[index], ends[index + 1])
             own = {name: statics[name][rows].numpy() for name in ("mass", "volume", "material")}
             _complete(configuration, outcome, stored[index], own, built, index)
+    return shares
 
 
 def _parameters(

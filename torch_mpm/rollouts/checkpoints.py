@@ -7,20 +7,32 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import torch
 from torch import Tensor
 from torch.utils import _pytree
 
-from ..boundaries.control import motions_of
+from ..boundaries.control import Poses, motions_of
 from ..errors import check_count, check_flag, check_number
 from ..grid.grid import same_pools
 from ..state.state import CONSTANTS, State
 from ..step.status import aside, uncounted
 from .recompute import called_again
 
-Advance = Callable[[State, int, int], State]
+
+class Stored(Protocol):
+    """A `State`, or a pytree of tensors with one."""
+
+    @property
+    def x(self) -> Tensor: ...
+    @property
+    def poses(self) -> Poses: ...
+    def with_poses(self: S, poses: Poses) -> S: ...
+
+
+S = TypeVar("S", bound=Stored)
+Advance = Callable[[S, int, int], S]
 """Function of (state, count, k) that returns the state `count` steps later; the first of them is step k."""
 
 
@@ -184,31 +196,43 @@ def _time(checkpoints: Checkpoints, n: int, needs: Needs) -> float:
     return n + checkpoints.repetitions(n, needs.in_op) + needs.steps_of_a_call * calls
 
 
+def from_python(
+    advance: Advance[S], state: S, n: int, checkpoints: Checkpoints | None, step: Any, steps_per_call: int = 1
+) -> S:
+    """The state n steps later, of single steps or of calls of several that autograd records as they are computed; with
+    checkpoints, which have no `memory`, as many states are stored as these say."""
+    if checkpoints is None or n == 0:
+        return advance(state, n, 0)
+    if checkpoints.states is not None:
+        parts = dataclasses.replace(checkpoints, every=checkpoints.every or steps_per_call)
+        return binomial(advance, state, n, parts, step)
+    return _in_segments(advance, state, n, checkpoints, step)
+
+
 # ---- every n-th step
 
 
-def in_segments(advance: Advance, state: State, n: int, checkpoints: Checkpoints, step: Any) -> State:
+def _in_segments(advance: Advance[S], state: S, n: int, checkpoints: Checkpoints, step: Any) -> S:
     """The state n steps later; only the first state of each segment is stored for the backward pass."""
     assert checkpoints.every is not None
-    with offloaded(state) if checkpoints.offload else contextlib.nullcontext():
-        for first in range(0, n, checkpoints.every):
-            state = recomputed(advance, state, min(checkpoints.every, n - first), first, step)
+    for first in range(0, n, checkpoints.every):
+        state = recomputed(advance, state, min(checkpoints.every, n - first), first, step)
     return state
 
 
-def recomputed(advance: Advance, state: State, count: int, first: int, step: Any) -> State:
+def recomputed(advance: Advance[S], state: S, count: int, first: int, step: Any) -> S:
     """`advance(state, count, first)` whose arguments are stored; the backward pass recomputes its steps.
 
     The recomputed steps use the pools and the motions of obstacles of the first computation, and are not counted for
     `check` of the step.
     """
     leaves, layout = _pytree.tree_flatten(state)
-    motions, poses = motions_of(step, state), state.poses  # A stored state would keep the preceding graph alive.
+    motions, poses = motions_of(step, state.poses), state.poses  # A stored state would keep the preceding graph alive.
     again, pools = False, list[int]()
 
-    def steps(*tensors: Tensor) -> State:
+    def steps(*tensors: Tensor) -> S:
         nonlocal again
-        given = _pytree.tree_unflatten(tensors, layout).with_poses(poses)
+        given: S = _pytree.tree_unflatten(tensors, layout).with_poses(poses)
         with contextlib.ExitStack() as stack:
             stack.enter_context(same_pools(pools))
             if again:  # Graphs write to the tensors that `aside` would replace.
@@ -218,7 +242,7 @@ def recomputed(advance: Advance, state: State, count: int, first: int, step: Any
             again = True
             return advance(given, count, first)
 
-    result: State = called_again(steps, *leaves)
+    result: S = called_again(steps, *leaves)
     return result
 
 
@@ -247,7 +271,7 @@ class _EachTime(contextlib.AbstractContextManager[None]):
 # ---- binomial
 
 
-def binomial(advance: Advance, state: State, n: int, checkpoints: Checkpoints, step: Any, in_op: bool = False) -> State:
+def binomial(advance: Advance[S], state: S, n: int, checkpoints: Checkpoints, step: Any, in_op: bool = False) -> S:
     """The state n steps later, with at most `states` states stored at a time beside the initial one; n is 1 or more.
 
     The parts of `every` steps are split in two groups. The backward pass processes the second group first, with one
@@ -260,16 +284,16 @@ def binomial(advance: Advance, state: State, n: int, checkpoints: Checkpoints, s
 
     parts = checkpoints.parts(n)
 
-    def part(state: State, k: int) -> State:
+    def part(state: S, k: int) -> S:
         return advance(state, min(every, n - k * every), k * every)
 
-    def group(state: State, first: int, count: int, states: int) -> State:
-        def again(now: State, *_: int) -> State:
+    def group(state: S, first: int, count: int, states: int) -> S:
+        def again(now: S, *_: int) -> S:
             return run(now, first, count, states)
 
         return recomputed(again, state, count * every, first * every, step)
 
-    def run(state: State, first: int, count: int, states: int) -> State:
+    def run(state: S, first: int, count: int, states: int) -> S:
         while count > 1:
             size = _split(count, states)
             state = part(state, first) if size == 1 and in_op else group(state, first, size, states)

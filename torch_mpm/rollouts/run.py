@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
+import contextlib
 from collections.abc import Callable
 from typing import Any
 
@@ -15,7 +15,7 @@ from ..state.state import State, check_state
 from ..step.step import Step
 from .anomaly import begin, detecting, watch
 from .budget import within_budget
-from .checkpoints import Checkpoints, as_checkpoints, binomial, in_segments
+from .checkpoints import Checkpoints, as_checkpoints, from_python, offloaded
 from .fused_op import in_calls
 from .gradient_norms import GradientNorms
 from .graph_replay import replayed
@@ -178,14 +178,10 @@ def _from_python(steps: Steps, state: State, plan: RolloutPlan) -> State:
 
     if checkpoints is not None and n > 0 and _compiles_at_next_call(step):
         state, steps, n = advance(state, 1, 0), steps.part(n - 1, 1), n - 1
-    if checkpoints is None or n == 0:
-        return advance(state, n, 0)
-    if isinstance(step, Step):
+    if isinstance(step, Step) and checkpoints is not None and n > 0:
         state = step.prepare(state)
-    if checkpoints.states is not None:
-        parts = dataclasses.replace(checkpoints, every=checkpoints.every or plan.steps_per_call)
-        return binomial(advance, state, n, parts, step)
-    return in_segments(advance, state, n, checkpoints, step)
+    with offloaded(state) if checkpoints is not None and checkpoints.offload else contextlib.nullcontext():
+        return from_python(advance, state, n, checkpoints, step, plan.steps_per_call)
 
 
 def _compiles_at_next_call(step: Any) -> bool:
