@@ -7,7 +7,7 @@ namespace {
 
 template <int Order, class T, int D>
 struct HeatSurfaceSource {
-  using Shape = ScatterShape<Order, T, D, 1, D, true>;
+  using Shape = SmallScatterShape<Order, T, D, 1, D, true>;
   static constexpr int resident = 0;
   static constexpr bool displaced = true;
   Topology<T, D> topology;
@@ -47,7 +47,7 @@ struct HeatSurfaceSource {
 // The exchange of particles with a held surface.
 template <int Order, class T, int D>
 struct HeatExchangeSource {
-  using Shape = ScatterShape<Order, T, D, 0, 1, false>;
+  using Shape = SmallScatterShape<Order, T, D, 0, 1, false>;
   static constexpr int resident = 0;
   static constexpr bool displaced = true;
   Topology<T, D> topology;
