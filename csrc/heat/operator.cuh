@@ -77,7 +77,8 @@ struct PackedItems {
   // In a work space, where take(bytes) returns memory.
   template <class Take>
   void lay_out(const Topology<T, D>& t, bool has_tiles, const Take& take) {
-    const int64_t items = room_for_items(t.max_blocks, t.particles);
+    // Small items, in 2-D, may be more than most_items().
+    const int64_t items = D == 2 ? room_for_items(t.max_blocks, t.particles) : most_items(t.max_blocks, t.particles);
     particles = reinterpret_cast<PackedParticle<T, D>*>(take(t.particles * sizeof(PackedParticle<T, D>)));
     counts = reinterpret_cast<uint16_t*>(take(items * kBlockNodes<D> * sizeof(uint16_t)));
     tiles = reinterpret_cast<T*>(take(has_tiles ? int64_t(t.max_blocks) * kTile * sizeof(T) : 0));

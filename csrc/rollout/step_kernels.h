@@ -190,7 +190,8 @@ struct Substeps {
     torch::stable::zero_(displacements);
     p2g.displaced = true;
     advance.loads_ahead = true;
-    for (LawUpdateArguments<T, D>& law : laws) law.runs_beside = !law.adds && in.heat.empty();
+    if (in.heat.empty())
+      for (LawUpdateArguments<T, D>& law : laws) law.runs_beside = !law.adds;
     next.particles = in.x.size(0);
     if (!in.heat.empty()) activation.out_of_block_cost = next.out_of_block_cost = kOutOfBlockCostWithHeat;
     next.obstacles = obstacles && !impulse.defined();  // impulses need the velocities before contact
@@ -318,7 +319,8 @@ struct Substeps {
     if (!nodes_are_clear)
       clear_memory(pool.nodes.data_ptr(), slots * int64_t(kBlockNodes<D>) * int64_t(sizeof(NodeRow<T, D>)));
 #else
-    if (!next.emptied && !nodes_are_clear) backend::clear(pool.nodes, stream);
+    // The sums of tiles are stored at all nodes of the active blocks.
+    if (!next.emptied && !nodes_are_clear && !tiles.defined()) backend::clear(pool.nodes, stream);
 #endif
   }
 

@@ -807,7 +807,7 @@ __global__ void __launch_bounds__(Source::Shape::threads, Source::resident)
   }
 }
 
-// Adds the sums of the tiles to the nodes: a thread for four words of a row of nodes along the last axis.
+// Stores the sums of the tiles at the nodes: a thread for four words of a row of nodes along the last axis.
 template <class S>
 __global__ void __launch_bounds__(kTileThreads)
     add_tiles_kernel(const Topology<typename S::T, S::D> t, const NodeField<typename S::T> nodes) {
@@ -826,7 +826,7 @@ __global__ void __launch_bounds__(kTileThreads)
 #pragma unroll
     for (int e = 0; e < 4; e++) {
       const int word = 4 * quad + e;
-      nodes.pointer[(first + word / K) * nodes.stride + word % K] += sum.e[e];
+      nodes.pointer[(first + word / K) * nodes.stride + word % K] = sum.e[e];
     }
   });
 }
