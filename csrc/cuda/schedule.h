@@ -10,8 +10,8 @@ namespace mpm::cuda {
 constexpr int kItemParticles = 576, kLeastItemParticles = 128;
 
 // Particles of a batch, and of an item of a call with heat at most, for small thread blocks: in 2-D a base block mostly
-// has 64 particles, four a cell, and then the number of thread blocks of a multiprocessor at once matters more than that
-// of their threads.
+// has 64 particles, four a cell, and then the number of thread blocks of a multiprocessor at once matters more than
+// that of their threads.
 template <int D>
 constexpr int kSmallItemParticles = D == 2 ? 256 : kItemParticles;
 

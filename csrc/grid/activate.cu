@@ -566,8 +566,8 @@ __global__ void __launch_bounds__(kThreads)
 
 unsigned blocks_for(int64_t threads) { return unsigned((threads + kThreads - 1) / kThreads); }
 
-// Thread blocks of the one kernel. Up to twice as many as fit in a cluster make one: its barriers are faster, and only a
-// cluster is launched in a chain, which matters most where the activation lasts.
+// Thread blocks of the one kernel. Up to twice as many as fit in a cluster make one: its barriers are faster, and only
+// a cluster is launched in a chain, which matters most where the activation lasts.
 unsigned blocks_at_once(int64_t threads) {
   const unsigned blocks = blocks_for(threads);
   return blocks > 2 * kLargestCluster ? blocks : std::min(blocks, kLargestCluster);

@@ -108,8 +108,8 @@ struct HeatToParticlesArguments {
   HeatValue<T> specific_heat, melting_point, latent_heat;
   Field<const T> scene_dt;
   double dt = 0, moment_scale = 1;
-  NodeField<const T> nodes;          // the sums from kHeatTheta on: increment and θ̄
-  Field<T> theta, gradient, liquid;  // results, on CUDA in other memory than the inputs
+  NodeField<const T> nodes;            // the sums from kHeatTheta on: increment and θ̄
+  Field<T> theta, gradient, liquid;    // results, on CUDA in other memory than the inputs
   HeatVolumesArguments<T, D> volumes;  // on CUDA, after the step; may be absent
   double* largest = nullptr;  // column [scenes] of the status, raised to the largest diffusion number of a particle
                               // whose liquid fraction changes

@@ -403,8 +403,8 @@ Substeps<T, D>::Substeps(const SubstepsInputs& inputs) : in(inputs) {
   STD_TORCH_CHECK(in.wants_C || !in.apic, "apic needs wants_C");
   activation = activate_arguments<T, D>(in.lattice, in.x, in.scene, in.ids, in.scenes, in.max_blocks);
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda
-  // An item fits into a batch of the kernels of heat. On a deterministic grid the items of a scene, and the order of its
-  // sums, do not depend on the other scenes.
+  // An item fits into a batch of the kernels of heat. On a deterministic grid the items of a scene, and the order of
+  // its sums, do not depend on the other scenes.
   if (!in.heat.empty()) {
     activation.most_of_item = cuda::kSmallItemParticles<D>;
     if (!in.lattice.deterministic())
