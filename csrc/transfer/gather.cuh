@@ -233,8 +233,7 @@ __device__ void add_hessian(const Support& support, const Weights<S::Order, T, S
 
 // ---- The two orders
 
-// Threads of a block: of a task, in 2-D half as many as in 3-D, where a base block mostly has 64 particles, four a
-// cell.
+// Threads of a block. In 2-D a base block mostly has 64 particles, four a cell.
 constexpr int kMostGatherThreads = 128;
 template <int D>
 constexpr int kGatherThreads = D == 2 ? 64 : kMostGatherThreads;
