@@ -9,6 +9,12 @@ namespace mpm::cuda {
 // there are few particles, so that there are about two items for each of the 130 multiprocessors of a large device.
 constexpr int kItemParticles = 576, kLeastItemParticles = 128;
 
+// Particles of a batch, and of an item of a call with heat at most, for small thread blocks: in 2-D a base block mostly
+// has 64 particles, four a cell, and then the number of thread blocks of a multiprocessor at once matters more than
+// that of their threads.
+template <int D>
+constexpr int kSmallItemParticles = D == 2 ? 256 : kItemParticles;
+
 MPM_HD int item_particles(int64_t particles) {
   const int64_t shared = particles / 256;
   return int(shared < kLeastItemParticles ? kLeastItemParticles : shared > kItemParticles ? kItemParticles : shared);

@@ -30,19 +30,18 @@ void heat_layers(const HeatLayersArguments<T, D>& a) {
 }
 
 template <class T, int D>
-void heat_from_surface(const HeatFromSurfaceArguments<T, D>& a) {
-  for_nodes(a.topology, [&](int scene, int64_t i) { heat_of_surface(a, scene, i); });
+void heat_nodes(const HeatNodesArguments<T, D>& a) {
+  constexpr int64_t grain = 16384;  // nodes below which a range is not split
+  parallel_ranges(a.means.nodes, grain, [&](int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; i++) heat_mean(a.means, i);
+  });
+  if (a.surface.exchange || a.term_count > 0)
+    for_nodes(a.topology, [&](int scene, int64_t i) { heat_boundaries(a, scene, i); });
 }
 
-template <class T, int D>
-void heat_add_term(const HeatTermArguments<T, D>& a) {
-  for_nodes(a.topology, [&](int scene, int64_t i) { heat_term(a, scene, i); });
-}
-
-MPM_INSTANTIATE(heat_add_term, HeatTermArguments)
+MPM_INSTANTIATE(heat_nodes, HeatNodesArguments)
 MPM_INSTANTIATE(heat_hold, HeatHoldArguments)
 MPM_INSTANTIATE(heat_layers, HeatLayersArguments)
-MPM_INSTANTIATE(heat_from_surface, HeatFromSurfaceArguments)
 
 }  // namespace TORCH_MPM_ISA
 }  // namespace mpm::cpu

@@ -16,9 +16,9 @@ struct HeatAdvance {
   using Source = HeatSource<Order, T, D>;
   using Shape = typename Source::Shape;
   using Motion = AdvanceGather<Order, T, D, false, true>;
-  static constexpr int threads = Shape::threads;
+  static constexpr int threads = Shape::threads, most = kSmallItemParticles<D>;  // of an item
   // Thread blocks of a multiprocessor at once, which limits registers.
-  static constexpr int resident = Order == 2 && sizeof(T) == 4 ? 3 : 1;
+  static constexpr int resident = Order != 2 || sizeof(T) != 4 ? 1 : D == 2 ? 9 : 3;
   static constexpr bool quads = D == 3;  // the rows of the grid of a rollout are whole vectors then
   struct Loaded {
     typename Motion::Loaded motion;
@@ -67,8 +67,8 @@ struct AdvanceMemory {
   static constexpr int D = K::D, width = K::Shape::width, nodes = D == 2 ? width * width : width * width * width;
   ScatterMemory<typename K::Shape, true> scatter;
   NodeValue<T, D> velocities[nodes];
-  PackedOrder<HeatShape<K::Order, T, D>> order;
-  PackedParticle<T, D> packed[kItemParticles];  // in the order of the item
+  PackedOrder<HeatShape<K::Order, T, D>, K::most> order;
+  PackedParticle<T, D> packed[K::most];  // in the order of the item
 };
 
 // The passes over the particles of an item.
@@ -77,7 +77,7 @@ struct AdvanceItem {
   using T = typename K::T;
   using S = typename K::Shape;
   static constexpr int Order = K::Order, D = K::D, threads = K::threads;
-  static_assert(S::slices == (D == 2 ? 4 : 1) && S::batch == kItemParticles);
+  static_assert(S::batch == K::most);
   const K& k;
   AdvanceMemory<K>& m;
   const SharedParticles<S> shared;
@@ -126,7 +126,7 @@ struct AdvanceItem {
       T f[D];
       const bool in_block = m.scatter.base_block.template locate<Order>(topology().geometry, loaded.motion.x, cell, f);
       const int row = shared.row(i), list = list_of<S>(i, in_block, cell);
-      m.order.rank[i] = uint16_t(cell * kItemParticles + atomicAdd(&m.order.count[cell], 1));
+      m.order.rank[i] = uint16_t(cell * K::most + atomicAdd(&m.order.count[cell], 1));
       shared.next[row] = uint16_t(atomicExch(&m.scatter.head[list], row));
       if (!in_block) {
         m.scatter.out_of_block.particle[atomicAdd(&m.scatter.out_of_block.count, 1)] = uint16_t(i);
@@ -168,7 +168,7 @@ struct AdvanceItem {
     for (int c = threadIdx.x; c < Cells::cells; c += threads)
       k.packed.counts[int64_t(number) * Cells::cells + c] = uint16_t(m.order.count[c]);
     for (int i = threadIdx.x; i < count; i += threads) {
-      const int cell = m.order.rank[i] / kItemParticles, rank = m.order.rank[i] % kItemParticles;
+      const int cell = m.order.rank[i] / K::most, rank = m.order.rank[i] % K::most;
       store_packed(k.packed, m.order, begin, begin + count, cell, rank, m.packed[i], [&] { return particle(i); });
     }
   }

@@ -19,12 +19,9 @@ MPM_BACKEND_KERNELS(MPM_HEAT_KERNELS)
 #define MPM_HEAT_TRANSFER_KERNELS(PLAIN, ORDERED, SIZE) \
   PLAIN(heat_volumes, HeatVolumesArguments)             \
   ORDERED(heat_to_nodes, HeatToNodesArguments)          \
-  PLAIN(heat_means, HeatMeansArguments)                 \
+  PLAIN(heat_nodes, HeatNodesArguments)                 \
   ORDERED(heat_surface, HeatSurfaceArguments)           \
-  PLAIN(heat_add_term, HeatTermArguments)               \
   PLAIN(heat_hold, HeatHoldArguments)                   \
-  PLAIN(heat_layers, HeatLayersArguments)               \
-  PLAIN(heat_from_surface, HeatFromSurfaceArguments)    \
   PLAIN(heat_increments, HeatIncrementsArguments)       \
   ORDERED(heat_to_particles, HeatToParticlesArguments)
 MPM_BACKEND_KERNELS(MPM_HEAT_TRANSFER_KERNELS)
@@ -34,7 +31,9 @@ MPM_BACKEND_KERNELS(MPM_HEAT_TRANSFER_KERNELS)
   PLAIN(heat_finish, HeatFinishArguments)
 MPM_BACKEND_KERNELS(MPM_HEAT_SIMPLE_KERNELS)
 
-#define MPM_HEAT_CPU_KERNELS(PLAIN, ORDERED, SIZE) PLAIN(heat_find_slots, HeatSlotsArguments)
+#define MPM_HEAT_CPU_KERNELS(PLAIN, ORDERED, SIZE) \
+  PLAIN(heat_find_slots, HeatSlotsArguments)       \
+  PLAIN(heat_layers, HeatLayersArguments)
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
 MPM_BACKEND_KERNELS(MPM_HEAT_CPU_KERNELS)
 #endif
@@ -42,7 +41,7 @@ MPM_BACKEND_KERNELS(MPM_HEAT_CPU_KERNELS)
 // On CUDA alone.
 #define MPM_HEAT_CUDA_KERNELS(PLAIN, ORDERED, SIZE) \
   ORDERED(heat_advance, HeatAdvanceArguments)       \
-  ORDERED(heat_exchange, ScatterArguments)
+  ORDERED(heat_exchange, HeatExchangeArguments)
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda
 MPM_BACKEND_KERNELS(MPM_HEAT_CUDA_KERNELS)
 #endif

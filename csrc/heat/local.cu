@@ -24,21 +24,6 @@ MPM_HD void hold(const HeatHoldArguments<T, D>& a, int64_t i) {
   if (pose.acts) hold_node(a, pose, scene, corner, int(i % kBlockNodes<D>), i);
 }
 
-template <class T, int D>
-MPM_HD void layer(const HeatLayersArguments<T, D>& a, int64_t p) {
-  heat_layer_of(a, pose_of(a.contact, a.obstacle, scene_of_particle(a, p)), p);
-}
-
-template <class T, int D>
-MPM_HD void from_surface(const HeatFromSurfaceArguments<T, D>& a, int64_t i) {
-  at_node<heat_of_surface<T, D>>(a.topology, a, i);
-}
-
-template <class T, int D>
-MPM_HD void add_term(const HeatTermArguments<T, D>& a, int64_t i) {
-  at_node<heat_term<T, D>>(a.topology, a, i);
-}
-
 // The part of entry i of `count`.
 template <class T>
 MPM_HD void clear(const HeatCleared<T>& cleared, int64_t i, int64_t count) {
@@ -46,9 +31,10 @@ MPM_HD void clear(const HeatCleared<T>& cleared, int64_t i, int64_t count) {
 }
 
 template <class T, int D>
-MPM_HD void mean_and_clear(const HeatMeansArguments<T, D>& a, int64_t i) {
-  heat_mean(a, i);
-  clear(a.cleared, i, a.nodes);
+MPM_HD void begin_node(const HeatNodesArguments<T, D>& a, int64_t i) {
+  heat_mean(a.means, i);
+  if (i < nodes_of(a.topology)) at_node<heat_boundaries<T, D>>(a.topology, a, i);
+  clear(a.means.cleared, i, a.means.nodes);
 }
 
 // Work at a scene: i < scenes.
@@ -84,8 +70,8 @@ void heat_volumes(const HeatVolumesArguments<T, D>& a, Stream stream) {
 }
 
 template <class T, int D>
-void heat_means(const HeatMeansArguments<T, D>& a, Stream stream) {
-  for_each<mean_and_clear<T, D>>(a.nodes, a, stream);
+void heat_nodes(const HeatNodesArguments<T, D>& a, Stream stream) {
+  for_each<begin_node<T, D>>(a.means.nodes, a, stream);
 }
 
 template <class T, int D>
@@ -98,28 +84,10 @@ void heat_hold(const HeatHoldArguments<T, D>& a, Stream stream) {
   for_each<hold<T, D>>(nodes_of(a.topology), a, stream);
 }
 
-template <class T, int D>
-void heat_layers(const HeatLayersArguments<T, D>& a, Stream stream) {
-  for_each<layer<T, D>>(a.particles, a, stream);
-}
-
-template <class T, int D>
-void heat_from_surface(const HeatFromSurfaceArguments<T, D>& a, Stream stream) {
-  for_each<from_surface<T, D>>(nodes_of(a.topology), a, stream);
-}
-
-template <class T, int D>
-void heat_add_term(const HeatTermArguments<T, D>& a, Stream stream) {
-  for_each<add_term<T, D>>(nodes_of(a.topology), a, stream);
-}
-
 MPM_INSTANTIATE(heat_volumes, HeatVolumesArguments)
-MPM_INSTANTIATE(heat_means, HeatMeansArguments)
+MPM_INSTANTIATE(heat_nodes, HeatNodesArguments)
 MPM_INSTANTIATE(heat_increments, HeatIncrementsArguments)
 MPM_INSTANTIATE(heat_finish, HeatFinishArguments)
 MPM_INSTANTIATE(heat_hold, HeatHoldArguments)
-MPM_INSTANTIATE(heat_layers, HeatLayersArguments)
-MPM_INSTANTIATE(heat_from_surface, HeatFromSurfaceArguments)
-MPM_INSTANTIATE(heat_add_term, HeatTermArguments)
 
 }  // namespace mpm::cuda

@@ -58,8 +58,9 @@ MPM_HD int scene_of_particle(const HeatLayersArguments<T, D>& a, int64_t p) {
   return scene < 0 || a.scenes <= 0 ? 0 : scene < a.scenes ? scene : int(a.scenes - 1);
 }
 
+// Returns the exchange.
 template <class T, int D>
-MPM_HD void heat_layer_of(const HeatLayersArguments<T, D>& a, const ObstaclePose<T, D>& pose, int64_t p) {
+MPM_HD T heat_layer_of(const HeatLayersArguments<T, D>& a, const ObstaclePose<T, D>& pose, int64_t p) {
   const One<T> at{p};
   const T distance = distance_from(pose, load_vector<D>(at, a.x)), width = T(a.width);
   T conductance = load_scalar(at, constant(a.conductance)), exchange = T(0);
@@ -70,6 +71,7 @@ MPM_HD void heat_layer_of(const HeatLayersArguments<T, D>& a, const ObstaclePose
     store_scalar(at, a.conductance, conductance);
   }
   store_scalar(at, a.exchange, exchange);
+  return exchange;
 }
 
 // Heat from inside the matter of a particle [W], in a step of dt; none in a paused scene.
@@ -189,6 +191,18 @@ MPM_HD void heat_term(const HeatTermArguments<T, D>& a, int scene, int64_t i) {
       heat_of_term(a.term, normal_of_node(a, i), a.theta[i], number[0], number[1], T(a.reference));
   a.exchange[i] += linear.coefficient;
   a.source[i] += linear.power;
+}
+
+// Boundaries of heat at a node.
+template <class T, int D>
+MPM_HD void heat_boundaries(const HeatNodesArguments<T, D>& a, int scene, int64_t i) {
+  if (a.surface.exchange) heat_of_surface(a.surface, scene, i);
+  HeatTermArguments<T, D> term = a.terms;
+  for (int k = 0; k < a.term_count; k++) {
+    term.term = a.term[k];
+    term.number = a.number[k];
+    heat_term(term, scene, i);
+  }
 }
 
 // ---- scenes

@@ -39,11 +39,11 @@ __device__ P load_once(const P* p) {
 }
 
 // The packed order of an item: row by row, where the lanes of a row are those with a particle of this rank.
-template <class S>
+template <class S, int Most = kItemParticles>
 struct PackedOrder {
-  uint16_t rank[kItemParticles];
-  unsigned lanes[kItemParticles];  // of a row
-  uint16_t start[kItemParticles];  // of a row in the packed order
+  uint16_t rank[Most];
+  unsigned lanes[Most];  // of a row
+  uint16_t start[Most];  // of a row in the packed order
   int count[S::cells + 1], row[S::parts];
 
   __device__ int place(int cell, int rank) const {
@@ -77,7 +77,8 @@ struct PackedItems {
   // In a work space, where take(bytes) returns memory.
   template <class Take>
   void lay_out(const Topology<T, D>& t, bool has_tiles, const Take& take) {
-    const int64_t items = most_items(t.max_blocks, t.particles);
+    // Small items, in 2-D, may be more than most_items().
+    const int64_t items = D == 2 ? room_for_items(t.max_blocks, t.particles) : most_items(t.max_blocks, t.particles);
     particles = reinterpret_cast<PackedParticle<T, D>*>(take(t.particles * sizeof(PackedParticle<T, D>)));
     counts = reinterpret_cast<uint16_t*>(take(items * kBlockNodes<D> * sizeof(uint16_t)));
     tiles = reinterpret_cast<T*>(take(has_tiles ? int64_t(t.max_blocks) * kTile * sizeof(T) : 0));
@@ -104,9 +105,9 @@ __device__ PackedParticle<T, D> packed_out_of_block(int particle, const T& condu
 
 // Stores a particle of the item [begin, end): in its cell, by its rank there; or out of the block, from the end on, by
 // its number particle().
-template <class S, class T, int D, class Number>
-__device__ void store_packed(const PackedItems<T, D>& packed, const PackedOrder<S>& order, int begin, int end, int cell,
-                             int rank, const PackedParticle<T, D>& q, const Number& particle) {
+template <class S, int Most, class T, int D, class Number>
+__device__ void store_packed(const PackedItems<T, D>& packed, const PackedOrder<S, Most>& order, int begin, int end,
+                             int cell, int rank, const PackedParticle<T, D>& q, const Number& particle) {
   if (cell < S::cells)
     packed.particles[begin + order.place(cell, rank)] = q;
   else
@@ -168,8 +169,8 @@ __device__ void walk_cells(const LaneCounts<S>& counts, const PackedParticle<T, 
 }
 
 // Makes the rows for the counts of the cells, by one warp.
-template <class S>
-__device__ void set_rows(PackedOrder<S>& m) {
+template <class S, int Most>
+__device__ void set_rows(PackedOrder<S, Most>& m) {
   const LaneCounts<S> counts(m.count);
 #pragma unroll
   for (int part = 0, row = 0, at = 0; part < S::parts; part++) {

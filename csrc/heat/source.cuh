@@ -32,7 +32,7 @@ __device__ Matrix<T, D> read_matrix_or_zero(const Columns<const T, D * D>& c, in
 // The particles store their conductance and blend; and their diffusion number, where that has a destination.
 template <int Order, class T, int D>
 struct HeatSource {
-  using Shape = ScatterShape<Order, T, D, 2, 2, false>;
+  using Shape = SmallScatterShape<Order, T, D, 2, 2, false>;
   using OfNodes = Contribution<T, D, 2, 2>;
   static constexpr int resident = 0;
   static constexpr bool displaced = true;

@@ -7,7 +7,7 @@ namespace {
 
 template <int Order, class T, int D>
 struct HeatSurfaceSource {
-  using Shape = ScatterShape<Order, T, D, 1, D, true>;
+  using Shape = SmallScatterShape<Order, T, D, 1, D, true>;
   static constexpr int resident = 0;
   static constexpr bool displaced = true;
   Topology<T, D> topology;
@@ -44,22 +44,26 @@ struct HeatSurfaceSource {
   }
 };
 
-// The exchange of particles with a held surface.
+// The exchange of particles with a held surface, and the rest of their conductance.
 template <int Order, class T, int D>
 struct HeatExchangeSource {
-  using Shape = ScatterShape<Order, T, D, 0, 1, false>;
+  using Shape = SmallScatterShape<Order, T, D, 0, 1, false>;
   static constexpr int resident = 0;
   static constexpr bool displaced = true;
   Topology<T, D> topology;
   NodeField<T> nodes;
   Columns<const T, D> position;
-  Columns<const T, 1> exchange;
+  HeatLayersArguments<T, D> layers;
 
-  explicit HeatExchangeSource(const ScatterArguments<T, D>& a)
-      : topology(a.topology), nodes(a.nodes), position(a.x), exchange(a.value) {}
+  explicit HeatExchangeSource(const HeatExchangeArguments<T, D>& a)
+      : topology(a.topology), nodes(a.nodes), position(a.layers.x), layers(a.layers) {}
 
-  __device__ T load(int p, int) const { return exchange.at(p); }
+  __device__ T load(int p, int scene) const {
+    return heat_layer_of(layers, pose_of(layers.contact, layers.obstacle, scene), p);
+  }
   __device__ Contribution<T, D, 0, 1> contribution(const T& loaded) const { return {{}, {loaded}, {}, {}}; }
+  // A particle outside the grid does not conduct.
+  __device__ void skip(int p, int) const { store_scalar(One<T>{p}, layers.exchange, T(0)); }
 };
 
 template <int Order_, class T_, int D_, bool Affine>
@@ -83,6 +87,7 @@ struct HeatGather {
   T moment_scale;
   Columns<T, 1> theta, liquid;
   Columns<T, D> gradient;
+  HeatVolumesArguments<T, D> volumes;
   double* largest;
 
   explicit HeatGather(const HeatToParticlesArguments<T, D>& a)
@@ -103,6 +108,7 @@ struct HeatGather {
         theta(a.theta),
         liquid(a.liquid),
         gradient(a.gradient),
+        volumes(a.volumes),
         largest(a.largest) {}
 
   __device__ Loaded load(int, int scene) const { return {scene}; }
@@ -133,9 +139,11 @@ struct HeatGather {
       liquid.at(p) = molten;
     }
     theta.at(p) = warm;
+    if (volumes.volume.pointer) heat_volume(volumes, p);
   }
   // Particles outside the grid keep their temperature.
   __device__ void skip(int p) const {
+    if (volumes.volume.pointer) heat_volume(volumes, p);
     theta.at(p) = theta_before.at(p);
 #pragma unroll
     for (int d = 0; d < D; d++)
@@ -158,7 +166,7 @@ void heat_surface(const HeatSurfaceArguments<T, D>& a, Stream stream) {
 }
 
 template <int Order, class T, int D>
-void heat_exchange(const ScatterArguments<T, D>& a, Stream stream) {
+void heat_exchange(const HeatExchangeArguments<T, D>& a, Stream stream) {
   launch_scatter(HeatExchangeSource<Order, T, D>(a), a.deterministic, stream);
 }
 
@@ -177,7 +185,7 @@ void heat_to_particles(const HeatToParticlesArguments<T, D>& a, Stream stream) {
 
 MPM_INSTANTIATE_ORDERS(heat_to_nodes, HeatToNodesArguments)
 MPM_INSTANTIATE_ORDERS(heat_surface, HeatSurfaceArguments)
-MPM_INSTANTIATE_ORDERS(heat_exchange, ScatterArguments)
+MPM_INSTANTIATE_ORDERS(heat_exchange, HeatExchangeArguments)
 MPM_INSTANTIATE_ORDERS(heat_to_particles, HeatToParticlesArguments)
 
 }  // namespace mpm::cuda

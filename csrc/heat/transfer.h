@@ -108,8 +108,9 @@ struct HeatToParticlesArguments {
   HeatValue<T> specific_heat, melting_point, latent_heat;
   Field<const T> scene_dt;
   double dt = 0, moment_scale = 1;
-  NodeField<const T> nodes;          // the sums from kHeatTheta on: increment and θ̄
-  Field<T> theta, gradient, liquid;  // results, on CUDA in other memory than the inputs
+  NodeField<const T> nodes;            // the sums from kHeatTheta on: increment and θ̄
+  Field<T> theta, gradient, liquid;    // results, on CUDA in other memory than the inputs
+  HeatVolumesArguments<T, D> volumes;  // on CUDA, after the step; may be absent
   double* largest = nullptr;  // column [scenes] of the status, raised to the largest diffusion number of a particle
                               // whose liquid fraction changes
 };
@@ -140,7 +141,16 @@ struct HeatLayersArguments {
   Field<T> conductance, exchange;         // κ V, replaced by the rest; and the exchange
 };
 
-// Heat from the surface at a temperature: source += exchange · temperature, for nodes of every scene.
+// These and the sums of the exchange at the nodes, on CUDA in one pass; particles may have left their base blocks.
+template <class T, int D>
+struct HeatExchangeArguments {
+  HeatLayersArguments<T, D> layers;
+  Topology<T, D> topology;
+  NodeField<T> nodes;
+  bool deterministic = false;
+};
+
+// Heat from the surface at a temperature: source = exchange · temperature, for nodes of every scene.
 template <class T, int D>
 struct HeatFromSurfaceArguments {
   Topology<T, D> topology;
@@ -188,6 +198,19 @@ struct HeatTermArguments {
   double reference = 0;
   T* exchange = nullptr;
   T* source = nullptr;
+};
+
+// The averages of the nodes, and then the boundaries there: heat from a held surface, and the terms.
+constexpr int kMostHeatTerms = 16;
+template <class T, int D>
+struct HeatNodesArguments {
+  HeatMeansArguments<T, D> means;
+  Topology<T, D> topology;
+  HeatFromSurfaceArguments<T, D> surface;  // without an exchange: none
+  int term_count = 0;
+  HeatTerm term[kMostHeatTerms]{};
+  const T* number[kMostHeatTerms]{};  // of each term
+  HeatTermArguments<T, D> terms;      // what all terms share
 };
 
 // The increments of all nodes: those of simple steps, and those of the solve for the other scenes, whose solves are

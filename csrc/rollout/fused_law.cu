@@ -28,8 +28,8 @@ int given_history_entries(const LawArguments<T, D>& law) {
 // Momentum of particles whose stress is computed as they are loaded, and stored where it has a destination. Where
 // requested, F or J is updated first if the previous G2P has deferred the update.
 template <class Law, class T, int D, bool MayMove>
-struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true> {
-  using Base = MomentumSource<2, T, D, Stress::moment, true>;
+struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true, false> {
+  using Base = MomentumSource<2, T, D, Stress::moment, true, false>;
   using Kernels = typename Law::template Kernels<Law>;
   static constexpr bool moves_F = Law::field == Deformation::gradient;
   static constexpr int resident = Law::gpu_p2g_blocks, entries = history_entries<Law, D>(kHistory<Law>);

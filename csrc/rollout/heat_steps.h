@@ -62,14 +62,17 @@ class HeatSteps {
 
   // Computes the present volumes; before laws change F.
   void begin(const Field<const T>& F, const Field<const T>& J, const Field<const T>& rest, backend::Stream stream) {
-    HeatVolumesArguments<T, D> a;
-    a.particles = particles();
-    a.rest = rest;
-    a.F = F;
-    a.J = J;
-    a.volume = column(fields.next(false), volume_);
+    HeatVolumesArguments<T, D> a = volumes_of(F, J, rest, fields.next(false));
     a.dissipated = dissipated();
     backend::heat_volumes(a, stream);
+  }
+
+  // Lets the transfer to the particles compute the volumes for the next substep, from F and J after this one, where G2P
+  // does not and begin() need not; on CUDA.
+  void store_volumes(const Field<const T>& F, const Field<const T>& J, const Field<const T>& rest) {
+    if (s_.with_heat.to_nodes.sums.pointer || heats_by_laws()) return;
+    volumes_after_ = volumes_of(F, J, rest, fields.next(true));
+    has_volumes_ = true;
   }
 
   // Lets G2P of the substep compute P2G of heat, and the volumes for the next substep; on CUDA in a call whose
@@ -90,6 +93,7 @@ class HeatSteps {
            const Field<const T>& velocity_gradient, const Field<const int>& scene, backend::Stream stream) {
     const HeatSolution<T, D> solution = conduct(x, mass, rest, velocity_gradient, scene, stream);
     HeatToParticlesArguments<T, D> up = to_particles(solution.down, true);
+    up.volumes = volumes_after_;
     backend::heat_to_particles(in_.lattice.order(), up, stream);
     fields.go(true);
   }
@@ -117,8 +121,8 @@ class HeatSteps {
                              const Field<const int>& scene, backend::Stream stream, const T* known = nullptr) {
     const Field<const T>& x = down.x;
     if (holds_surface()) add_layers(x, scene, stream);
-    if (!solves_for_sums()) means(stream);
-    if (has_terms()) add_terms(x, rest, stream);
+    if (has_terms()) backend::heat_surface(in_.lattice.order(), surface(x, rest), stream);
+    if (!solves_for_sums()) backend::heat_nodes(nodes(), stream);
     HeatArguments<T, D> a = equations(x, stream);
     if (known)
       use_increments(a, known, stream);
@@ -196,12 +200,16 @@ class HeatSteps {
     return {column(f, 0), column(f, gradient_), column(f, liquid_), column(f, volume_)};
   }
 
+  HeatVolumesArguments<T, D> volumes_of(const Field<const T>& F, const Field<const T>& J, const Field<const T>& rest,
+                                        const Field<T>& to) const {
+    return {particles(), rest, F, J, column(to, volume_), {}};
+  }
+
   void pack();
   void check_held();
   void check_terms();
-  void means(backend::Stream stream);
+  HeatNodesArguments<T, D> nodes() const;
   HeatCleared<T> next_cleared() const;
-  void add_terms(const Field<const T>& x, const Field<const T>& rest, backend::Stream stream);
   void add_layers(const Field<const T>& x, const Field<const int>& scene, backend::Stream stream);
   void hold_nodes(HeatArguments<T, D>& a, backend::Stream stream);
   void read_parameter(const Tensor& t, const char* name);
@@ -224,6 +232,7 @@ class HeatSteps {
   std::vector<int> own_;              // index in `parameters`, or -1
   Tensor conductance_, blend_, number_;
   bool has_volumes_ = false, for_record_ = true;
+  HeatVolumesArguments<T, D> volumes_after_;
   Field<const T> temperatures_;   // of the held obstacles [K, B]
   Tensor exchange_of_particles_;  // with the held surface
   Tensor start_, fixed_;
@@ -335,22 +344,23 @@ HeatLayersArguments<T, D> HeatSteps<T, D>::layers(const Field<const T>& x, const
   return a;
 }
 
-// The rest of the conductance in the layer, and its exchange at the nodes.
+// The rest of the conductance in the layer, and its exchange, which is added to the nodes.
 template <class T, int D>
 void HeatSteps<T, D>::add_layers(const Field<const T>& x, const Field<const int>& scene, backend::Stream stream) {
+  const NodeField<T> nodes{exchange_, 1, 1, s_.tile_memory()};
+#if MPM_BACKEND == MPM_BACKEND_IS_cuda
+  const HeatExchangeArguments<T, D> both{layers(x, scene), s_.p2g.topology, nodes, in_.lattice.deterministic()};
+  backend::heat_exchange(in_.lattice.order(), both, stream);
+#else
   backend::heat_layers(layers(x, scene), stream);
   ScatterArguments<T, D> down;
   down.topology = s_.p2g.topology;
   down.x = x;
   down.value = field<const T>(exchange_of_particles_);
   down.deterministic = in_.lattice.deterministic();
-  down.nodes = {exchange_, 1, 1, s_.tile_memory()};
-#if MPM_BACKEND == MPM_BACKEND_IS_cuda
-  backend::heat_exchange(in_.lattice.order(), down, stream);  // of particles that may have left their base blocks
-#else
+  down.nodes = nodes;
   backend::scatter(in_.lattice.order(), down, stream);
 #endif
-  backend::heat_from_surface(from_surface(), stream);
 }
 
 // Heat from the held surface.
@@ -506,19 +516,28 @@ HeatToParticlesArguments<T, D> HeatSteps<T, D>::to_particles(const HeatToNodesAr
   return a;
 }
 
+// The averages of the nodes, and the boundaries there.
 template <class T, int D>
-void HeatSteps<T, D>::means(backend::Stream stream) {
-  HeatMeansArguments<T, D> a;
-  a.nodes = used_slots() * kBlockNodes<D>;
-  a.sums = sums_;
-  a.theta = static_cast<T*>(theta_.data_ptr());
-  a.capacity = static_cast<T*>(capacity_.data_ptr());
+HeatNodesArguments<T, D> HeatSteps<T, D>::nodes() const {
+  HeatNodesArguments<T, D> a;
+  a.topology = s_.p2g.topology;
+  HeatMeansArguments<T, D>& means = a.means;
+  means.nodes = used_slots() * kBlockNodes<D>;
+  means.sums = sums_;
+  means.theta = static_cast<T*>(theta_.data_ptr());
+  means.capacity = static_cast<T*>(capacity_.data_ptr());
   if (held_nodes() > 0) {
-    a.start = static_cast<T*>(start_.data_ptr());
-    a.fixed = static_cast<bool*>(fixed_.data_ptr());
+    means.start = static_cast<T*>(start_.data_ptr());
+    means.fixed = static_cast<bool*>(fixed_.data_ptr());
   }
-  a.cleared = next_cleared();
-  backend::heat_means(a, stream);
+  means.cleared = next_cleared();
+  if (holds_surface()) a.surface = from_surface();
+  for (const HeatTermArguments<T, D>& term : terms()) {
+    a.terms = term;
+    a.term[a.term_count] = term.term;
+    a.number[a.term_count++] = term.number;
+  }
+  return a;
 }
 
 // The memory of the next substep.
@@ -533,6 +552,7 @@ template <class T, int D>
 void HeatSteps<T, D>::check_terms() {
   const int64_t count = int64_t(in_.heat_terms.size());
   STD_TORCH_CHECK(given(kNumbers) == (count > 0), "heat_terms needs numbers in heat_boundaries");
+  STD_TORCH_CHECK(count < kMostHeatTerms, "heat_terms must have at most ", kMostHeatTerms - 1, " entries, got ", count);
   for (const int64_t term : in_.heat_terms)
     STD_TORCH_CHECK(term >= 0 && term <= int64_t(HeatTerm::radiation), "heat_terms must be 0 to 2, got ", term);
   if (count == 0) return;
@@ -578,12 +598,6 @@ std::vector<HeatTermArguments<T, D>> HeatSteps<T, D>::terms() const {
   a.term = HeatTerm::power;
   if (has_power() || heats_by_laws()) list.push_back(a);
   return list;
-}
-
-template <class T, int D>
-void HeatSteps<T, D>::add_terms(const Field<const T>& x, const Field<const T>& rest, backend::Stream stream) {
-  backend::heat_surface(in_.lattice.order(), surface(x, rest), stream);
-  for (const HeatTermArguments<T, D>& term : terms()) backend::heat_add_term(term, stream);
 }
 
 // The equations of the temperatures of the nodes.

@@ -190,7 +190,8 @@ struct Substeps {
     torch::stable::zero_(displacements);
     p2g.displaced = true;
     advance.loads_ahead = true;
-    for (LawUpdateArguments<T, D>& law : laws) law.runs_beside = !law.adds && in.heat.empty();
+    if (in.heat.empty())
+      for (LawUpdateArguments<T, D>& law : laws) law.runs_beside = !law.adds;
     next.particles = in.x.size(0);
     if (!in.heat.empty()) activation.out_of_block_cost = next.out_of_block_cost = kOutOfBlockCostWithHeat;
     next.obstacles = obstacles && !impulse.defined();  // impulses need the velocities before contact
@@ -318,7 +319,8 @@ struct Substeps {
     if (!nodes_are_clear)
       clear_memory(pool.nodes.data_ptr(), slots * int64_t(kBlockNodes<D>) * int64_t(sizeof(NodeRow<T, D>)));
 #else
-    if (!next.emptied && !nodes_are_clear) backend::clear(pool.nodes, stream);
+    // The sums of tiles are stored at all nodes of the active blocks.
+    if (!next.emptied && !nodes_are_clear && !tiles.defined()) backend::clear(pool.nodes, stream);
 #endif
   }
 
@@ -401,8 +403,13 @@ Substeps<T, D>::Substeps(const SubstepsInputs& inputs) : in(inputs) {
   STD_TORCH_CHECK(in.wants_C || !in.apic, "apic needs wants_C");
   activation = activate_arguments<T, D>(in.lattice, in.x, in.scene, in.ids, in.scenes, in.max_blocks);
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda
-  // So that the items of a scene with heat, and the order of its sums, do not depend on the other scenes.
-  if (in.lattice.deterministic() && !in.heat.empty()) activation.most_of_item = cuda::kItemParticles;
+  // An item fits into a batch of the kernels of heat. On a deterministic grid the items of a scene, and the order of
+  // its sums, do not depend on the other scenes.
+  if (!in.heat.empty()) {
+    activation.most_of_item = cuda::kSmallItemParticles<D>;
+    if (!in.lattice.deterministic())
+      activation.most_of_item = std::min(activation.most_of_item, cuda::item_particles(in.x.size(0)));
+  }
 #endif
   if (has(in.previous_status))
     previous_status = int_pointer(*in.previous_status, "previous_status", in.x, {1 + in.scenes, kStatusSize});

@@ -83,6 +83,8 @@ class ThermalLaws {
       if (melts) a.coherency = laws[k].coherency;
     }
     for (size_t k = 0; k < laws.size(); k++) make_buffers(k);
+    // The law of a liquid reads and writes nothing of that of its solid, before which its inputs are computed.
+    for (size_t k = 0; k < laws.size(); k++) s_.laws[k].runs_beside = s_.calls[k].melts;
   }
 
   // Replaces the settings of Substeps::read and Substeps::write for these laws. F and J after the laws are written to

@@ -233,12 +233,16 @@ __device__ void add_hessian(const Support& support, const Weights<S::Order, T, S
 
 // ---- The two orders
 
-constexpr int kGatherThreads = 128;
+// Threads of a block. In 2-D a base block mostly has 64 particles, four a cell.
+constexpr int kMostGatherThreads = 128;
+template <int D>
+constexpr int kGatherThreads = D == 2 ? 64 : kMostGatherThreads;
 
 // Number of thread blocks that should fit in a multiprocessor at once, which limits registers: measured for float and
-// quadratic weights.
+// quadratic weights with the threads of a block in 3-D.
 template <class Task>
-constexpr int kResident = Task::Order == 2 && sizeof(typename Task::T) == 4 ? Task::resident : 2;
+constexpr int kResident = (Task::Order == 2 && sizeof(typename Task::T) == 4 ? Task::resident : 2) *
+                          (kMostGatherThreads / kGatherThreads<Task::D>);
 
 // Counts of particle places by the threads of whole warps; `lost` are bits of Drift::Loss.
 __device__ inline void add_to_displacement(Displacement* displacement, int out_of_block, int lost) {
@@ -355,9 +359,9 @@ __device__ void gather_in_memory_order(const Task& task, const Schedule<const in
   constexpr int D = Task::D;
   const Topology<T, D>& t = task.topology;
   grid_dependency_sync();
-  const int64_t stride = int64_t(gridDim.x) * kGatherThreads;
+  const int64_t stride = int64_t(gridDim.x) * kGatherThreads<D>;
 #pragma unroll 1
-  for (int64_t i = int64_t(blockIdx.x) * kGatherThreads + threadIdx.x; i < t.particles; i += stride) {
+  for (int64_t i = int64_t(blockIdx.x) * kGatherThreads<D> + threadIdx.x; i < t.particles; i += stride) {
     const int p = int(i);
     int slot = schedule.base_slot[p];
     const Vector<T, D> x = read_vector(task.position, p);
@@ -381,7 +385,7 @@ __device__ void gather_in_memory_order(const Task& task, const Schedule<const in
   }
 }
 
-template <bool Quads, int Order, class T, int K, int D, int Threads = kGatherThreads>
+template <bool Quads, int Order, class T, int K, int D, int Threads = kGatherThreads<D>>
 __device__ void load_tile(const NodeField<const T>& nodes, const int* slots, NodeValue<T, K>* tile) {
   constexpr int width = kBlockWidth + Order, size = D == 2 ? width * width : width * width * width;
   for (int i = threadIdx.x; i < size; i += Threads) {
@@ -412,7 +416,7 @@ __device__ void gather_out_of_block(const Task& task, const Schedule<const int>&
   const Topology<T, Task::D>& t = task.topology;
   __syncthreads();
 #pragma unroll 1
-  for (int s = threadIdx.x; s < out_of_block.count; s += kGatherThreads) {
+  for (int s = threadIdx.x; s < out_of_block.count; s += kGatherThreads<Task::D>) {
     const int p = t.index[begin + out_of_block.particle[s]];
     GridSupport<T, Task::K, Task::D, Quads> support{task.nodes};
     T f[Task::D];
@@ -446,12 +450,14 @@ __device__ void gather_by_items(const Task& task, const Schedule<const int>& sch
     // Positions are loaded one round ahead and the indices of particles two, so that loads overlap.
     int k = begin + threadIdx.x;
     const auto particle_at = [&](int k) { return t.index[k < end ? k : begin]; };
-    int p = particle_at(k), p_next = particle_at(k + kGatherThreads);
+    int p = particle_at(k), p_next = particle_at(k + kGatherThreads<D>);
     Vector<T, D> x = read_vector(task.position, p);
     __syncthreads();  // the previous tile is done
     if (threadIdx.x < 1 << D) slots[threadIdx.x] = schedule.neighbours[(item.x << D) + threadIdx.x];
-    if (may_be_displaced<Task> && threadIdx.x == 32) home.template set<Task::Order>(t, base_block);
-    if (may_be_displaced<Task> && threadIdx.x == 64) out_of_block.count = 0;
+    if (may_be_displaced<Task> && threadIdx.x == 32) {
+      home.template set<Task::Order>(t, base_block);
+      out_of_block.count = 0;
+    }
     const unsigned active = is_followed<Task> ? FollowerOf<Task>::active_blocks(t, item.x) : 0;
     typename Task::Loaded loaded;
     if constexpr (may_load_ahead<Task>) loaded = task.load(p, scene);
@@ -461,10 +467,10 @@ __device__ void gather_by_items(const Task& task, const Schedule<const int>& sch
     if constexpr (others > 0) load_tile<Quads, Task::Order, T, others, D>(task.others, slots, others_tile);
     __syncthreads();
 #pragma unroll 1
-    for (const int first = k; k < end; k += kGatherThreads) {
+    for (const int first = k; k < end; k += kGatherThreads<D>) {
       if (!may_load_ahead<Task> || k != first) loaded = task.load(p, scene);
       const Vector<T, D> x_next = read_vector(task.position, p_next);
-      const int p_after = particle_at(k + 2 * kGatherThreads);
+      const int p_after = particle_at(k + 2 * kGatherThreads<D>);
       int base[D], corner = 0;
       T f[D];
       const bool in_block = locate_in_block<Task::Order>(t, scene, base_block, x, base, f);
@@ -496,14 +502,14 @@ __device__ void gather_by_items(const Task& task, const Schedule<const int>& sch
       gather_out_of_block<Quads>(task, schedule, out_of_block, begin, home, active, follower);
   }
   grid_dependency_sync();
-  const int64_t stride = int64_t(gridDim.x) * kGatherThreads;
-  for (int64_t i = t.offsets[t.max_blocks] + int64_t(blockIdx.x) * kGatherThreads + threadIdx.x; i < t.particles;
+  const int64_t stride = int64_t(gridDim.x) * kGatherThreads<D>;
+  for (int64_t i = t.offsets[t.max_blocks] + int64_t(blockIdx.x) * kGatherThreads<D> + threadIdx.x; i < t.particles;
        i += stride)
     task.skip(t.index[i]);
 }
 
 template <bool Quads, class Task>
-__global__ void __launch_bounds__(kGatherThreads, kResident<Task>) gather_kernel(const Task task) {
+__global__ void __launch_bounds__(kGatherThreads<Task::D>, kResident<Task>) gather_kernel(const Task task) {
   if (!loads_ahead(task)) grid_dependency_sync();
   const Schedule<const int> schedule = schedule_of(task.topology);
   FollowerOf<Task> follower;
@@ -520,14 +526,14 @@ __global__ void __launch_bounds__(kGatherThreads, kResident<Task>) gather_kernel
 
 template <class Task, class Kernel>
 void launch_gather(const Task& task, Kernel* kernel, int64_t pieces, Stream stream) {
-  launch_in_chain(kernel, grid_size(task, pieces), kGatherThreads, 0, stream, task);
+  launch_in_chain(kernel, grid_size(task, pieces), kGatherThreads<Task::D>, 0, stream, task);
 }
 
 template <class Task>
 void launch_gather(const Task& task, Stream stream) {
   const int64_t particles = task.topology.particles;
   if (particles == 0) return;
-  const int64_t pieces = std::max(most_items(task.topology.max_blocks, particles), particles / kGatherThreads);
+  const int64_t pieces = std::max(most_items(task.topology.max_blocks, particles), particles / kGatherThreads<Task::D>);
   if constexpr (Task::K == 3 || Task::K == 4) {
     bool vectors = is_vector<Task::K>(task.nodes);
     if constexpr (kOthers<Task> > 0) vectors = vectors && is_vector<kOthers<Task>>(task.others);

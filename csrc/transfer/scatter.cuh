@@ -31,8 +31,9 @@ struct Contribution {
   T gradient[Linear][D];  // of the gradient per cell
 };
 
-// Slices: threads that share the particles of one cell and leading node.
-template <int Order_, class T_, int D_, int Plain_, int Linear_, bool Gradient_, int Slices = D_ == 2 ? 4 : 1>
+// Slices: threads that share the particles of one cell and leading node. Most: particles of a batch at most.
+template <int Order_, class T_, int D_, int Plain_, int Linear_, bool Gradient_, int Slices = D_ == 2 ? 4 : 1,
+          int Most = kItemParticles>
 struct ScatterShape {
   using T = T_;
   static constexpr int Order = Order_, D = D_, Plain = Plain_, Linear = Linear_;
@@ -55,7 +56,7 @@ struct ScatterShape {
   using Link = uint16_t;  // number of a row
   static constexpr int row_bytes = (quads * 4 + pairs * 2) * int(sizeof(T)) + int(sizeof(Link));
   static constexpr int fitting = 90 * 1024 / row_bytes / 32 * 32;
-  static constexpr int batch = fitting < kItemParticles ? fitting : kItemParticles;
+  static constexpr int batch = fitting < Most ? fitting : Most;
 
   // Sums, in the same memory: the slab of each thread. The four nodes of a block along the last axis are contiguous in
   // the grid, so rows of the tile are too, and are processed four words at a time.
@@ -69,6 +70,10 @@ struct ScatterShape {
   static constexpr size_t sum_bytes = size_t(threads) * part * channels * sizeof(T);
   static constexpr size_t shared_bytes = particle_bytes > sum_bytes ? particle_bytes : sum_bytes;
 };
+
+// The shape of small thread blocks, in 2-D.
+template <int Order, class T, int D, int Plain, int Linear, bool Gradient>
+using SmallScatterShape = ScatterShape<Order, T, D, Plain, Linear, Gradient, D == 2 ? 2 : 1, kSmallItemParticles<D>>;
 
 // Particles of a batch in shared memory, in linked lists of rows: one for each cell, or for each slice of it, and one
 // of particles outside their base block.
@@ -802,7 +807,7 @@ __global__ void __launch_bounds__(Source::Shape::threads, Source::resident)
   }
 }
 
-// Adds the sums of the tiles to the nodes: a thread for four words of a row of nodes along the last axis.
+// Stores the sums of the tiles at the nodes: a thread for four words of a row of nodes along the last axis.
 template <class S>
 __global__ void __launch_bounds__(kTileThreads)
     add_tiles_kernel(const Topology<typename S::T, S::D> t, const NodeField<typename S::T> nodes) {
@@ -821,7 +826,7 @@ __global__ void __launch_bounds__(kTileThreads)
 #pragma unroll
     for (int e = 0; e < 4; e++) {
       const int word = 4 * quad + e;
-      nodes.pointer[(first + word / K) * nodes.stride + word % K] += sum.e[e];
+      nodes.pointer[(first + word / K) * nodes.stride + word % K] = sum.e[e];
     }
   });
 }
@@ -866,12 +871,13 @@ void launch_scatter(const Source& source, bool deterministic, Stream stream) {
 
 enum class Stress { none, moment, gradient };
 
-// Drifts: particles may be in active blocks other than those of the activation.
-template <int Order, class T, int D, Stress Kind, bool Displaced>
+// Displaced: particles may be in active blocks other than those of the activation. Small: thread blocks.
+template <int Order, class T, int D, Stress Kind, bool Displaced, bool Small = true>
 struct MomentumSource {
   static constexpr bool displaced = Displaced;
   static constexpr bool with_stress = Kind != Stress::none, gradient = Kind == Stress::gradient;
-  using Shape = ScatterShape<Order, T, D, 1, D, gradient>;
+  using Shape = std::conditional_t<Small, SmallScatterShape<Order, T, D, 1, D, gradient>,
+                                   ScatterShape<Order, T, D, 1, D, gradient>>;
   // With fewer registers the loads of the stress would wait for each other.
   static constexpr int resident = !with_stress && Order == 2 && D == 3 && sizeof(T) == 4 ? 5 : 0;
   Topology<T, D> topology;

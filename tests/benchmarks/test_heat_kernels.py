@@ -23,7 +23,7 @@ NAMES = {
     "void mpm::cuda::scatter_kernel<mpm::cuda::ReorderingSource<mpm::baseline::NeoHookean, float, 3> >": "law and P2G",
     f"void {ANONYMOUS}next_grid_kernel<false, float, 3>(mpm::NextGridArguments<float, 3>)": "grid update",
     f"void {ANONYMOUS}advance_kernel<{ANONYMOUS}HeatAdvance<2, float, 3> >": "G2P and P2G of heat",
-    EACH.format("mean_and_clear", "HeatMeansArguments"): None,
+    EACH.format("begin_node", "HeatNodesArguments"): None,
     f"void {ANONYMOUS}pack_kernel<2, float, 3>({ANONYMOUS}SimpleKernel<2, float, 3>)": None,
     f"void {ANONYMOUS}product_kernel<2, float, 3>({ANONYMOUS}SimpleKernel<2, float, 3>)": "products with H",
     "void mpm::cuda::heat_kernel<2, float, 3>(mpm::cuda::HeatKernel<2, float, 3>)": None,

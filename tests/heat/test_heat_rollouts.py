@@ -472,6 +472,10 @@ def test_raw_op():
             "heat_terms": [3],
             "heat_boundaries": [none, ones[:2].view(1, 1, 2), none],
         },
+        "heat_terms must have at most 15 entries, got 16": {
+            "heat_terms": [0] * 16,
+            "heat_boundaries": [none, ones[:1].expand(16, 1, 2), none],
+        },
         "heat_terms needs numbers": {"heat_terms": [0]},
         "numbers of heat_terms must have shape .1, 1, 2.": {
             "heat_terms": [0],

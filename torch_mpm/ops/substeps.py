@@ -32,12 +32,12 @@ torch_mpm.heat, the temperature gradient [P, D]. Parameters are [], [1], [B] or 
 `heat_options` are the number of the transfer, the maximum number of iterations, and whether the last of the
 `held_obstacles` holds its surface (1) instead of the nodes in it; `heat_scalars` are tolerance, reference [K],
 the share of the dissipated energy that becomes heat, and the tolerance of the adjoint solves.
-`heat_terms` of the free surface are 0 for a flux, 1 for convection and 2 for radiation. `heat_boundaries` are the
-temperatures of the held obstacles [K, B], two numbers of each term [K, B, 2] (flux, coefficient or emissivity times the
-constant of Stefan and Boltzmann; and ambient temperature), and the power of a source [W/m³]; absent ones have the shape
-[0]. The columns of the result `heat` [P, m] are temperature, gradient and liquid fraction; `heat_status` [B, 3] has
-the number of solves that missed the tolerance, their largest residual [K], and the largest diffusion number of
-particles whose liquid fraction changed.
+`heat_terms` of the free surface, at most 15, are 0 for a flux, 1 for convection and 2 for radiation. `heat_boundaries`
+are the temperatures of the held obstacles [K, B], two numbers of each term [K, B, 2] (flux, coefficient or emissivity
+times the constant of Stefan and Boltzmann; and ambient temperature), and the power of a source [W/m³]; absent ones have
+the shape [0]. The columns of the result `heat` [P, m] are temperature, gradient and liquid fraction; `heat_status`
+[B, 3] has the number of solves that missed the tolerance, their largest residual [K], and the largest diffusion number
+of particles whose liquid fraction changed.
 
 Where temperatures change, a name in `laws` may be that of a solid and, after a ~, of its liquid, as `Melting` has them.
 `thermal` are records of three numbers: a law, one of its parameters or -1 for the linear expansion of its material or

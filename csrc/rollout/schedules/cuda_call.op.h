@@ -146,6 +146,7 @@ class CudaCall {
     s_.move(on);
     if (heat_) {
       const Field<const int> scene{s_.activation.scene, {s_.activation.scene_stride}};
+      heat_->store_volumes(constant(to.F), constant(to.J), s_.p2g.volume);
       heat_->run(from_.x, s_.p2g.mass, s_.p2g.volume, constant(to.C), scene, on);
     }
     s_.end_time(on);
