@@ -401,7 +401,7 @@ class SolidAt {
   }
 
   MPM_HD void add_face(bool wanted, int k, int f) {
-    Face<T, D> face{k, f, false, node_, {}, T(0), T(0)};
+    Face<T, D> face{k, f, false, node_, {}, T(0), T(0), false, T(0)};
     T beyond = T(0);
     if (any_of_warp(wanted)) {
       compute_face(wanted, poses_, reach_, face, beyond);
@@ -415,7 +415,7 @@ class SolidAt {
   // nearest to the node: those of the faces that join there; and where that point is covered, or the node is beside the
   // shape, those of the faces that neighbours of the node see.
   MPM_HD void add_by_distance(bool wanted, int k) {
-    Face<T, D> nearest{k, -1, false, node_, {}, T(0), T(0)};
+    Face<T, D> nearest{k, -1, false, node_, {}, T(0), T(0), false, T(0)};
     nearest.height = height_of(wanted, k, node_, nearest.normal);
     nearest.depth = T(0) - nearest.height;
     bool covered = wanted && nearest.height > a_.rounding && nearest.height <= reach_;
@@ -508,7 +508,7 @@ class SolidAt {
 
   // The plane that a point outside the shape sees, unless one with that normal is known.
   MPM_HD void add_plane(bool wanted, int k, const V& at) {
-    Face<T, D> face{k, -1, true, at, {}, T(0), T(0), true};
+    Face<T, D> face{k, -1, true, at, {}, T(0), T(0), true, T(0)};
     face.height = height_of(wanted, k, face.at, face.normal);
     face.depth = T(0) - (face.height + dot(face.normal, node_ + T(-1) * face.at));
     if (!wanted || !(face.height >= T(0)) || !(dot(face.normal, face.normal) > T(0.5))) return;
