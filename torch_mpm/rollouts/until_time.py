@@ -23,8 +23,9 @@ from .run import rollout
 from .sorting import STEPS_IN_ORDER, STEPS_WITH_HEAT, restore_order, sort_particles
 from .steps import Steps
 
-SEGMENT = 16
-"""Substeps between two choices of dt."""
+SEGMENT = 24
+"""Substeps between two choices of dt. A segment of 512 thousand particles on an H200 has a cost of six substeps of its
+own: its first and last substep have activations, and particles pass once more."""
 MOST_SEGMENTS = 64
 """Segments before the host queries the number of remaining substeps."""
 MOST_SUBSTEPS = 2**16
