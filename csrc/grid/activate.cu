@@ -17,16 +17,12 @@
 // that the activation still lasts.
 // The scans pass over tiles of the table; of a large table only over tiles with active blocks, which `classify` marks
 // and `list_tiles` lists in their order. Their writes are cleared before the next activation.
-// Deterministic mode replaces the ranks, which depend on the order of atomics, by the order of memory: by a sort, or in
-// the one kernel by counting the earlier particles of the same block.
+// Deterministic mode replaces the ranks, which depend on the order of atomics, by the order of memory.
 namespace mpm::cuda {
 namespace {
 
 constexpr int kThreads = 256;
 constexpr int kManyTiles = 512;  // number of tiles from which a list is worth two more kernels
-// Particles up to which counting the earlier ones of a block, for each particle, takes less time than the kernels of a
-// sort and of the phases: with 512 particles to a block.
-constexpr int64_t kMostCounted = 1 << 17;
 // Every kSampling-th thread block counts the base blocks met by its warps. More than 7/5 per warp on average, and the
 // gathers are faster in the order of memory than block by block.
 constexpr int kSampling = 64;
@@ -566,13 +562,6 @@ __global__ void __launch_bounds__(kThreads)
 
 unsigned blocks_for(int64_t threads) { return unsigned((threads + kThreads - 1) / kThreads); }
 
-// Thread blocks of the one kernel. Up to twice as many as fit in a cluster make one: its barriers are faster, and only
-// a cluster is launched in a chain, which matters most where the activation lasts.
-unsigned blocks_at_once(int64_t threads) {
-  const unsigned blocks = blocks_for(threads);
-  return blocks > 2 * kLargestCluster ? blocks : std::min(blocks, kLargestCluster);
-}
-
 }  // namespace
 
 template <class T, int D>
@@ -586,10 +575,9 @@ void activate(const ActivateArguments<T, D>& a, Stream stream) {
   const int table = a.scenes * a.geometry.blocks_per_scene;
   // Loops over slots with their end, or rows of the status; and over particles.
   const int64_t rows = std::max(a.particles, int64_t(std::max(a.slots(), a.scenes)) + 1);
-  const bool sorts = a.deterministic && a.particles > kMostCounted;
-  if ((a.displacement && !a.fresh) || (!w.marked && !sorts)) {
-    launch_at_once(activate_at_once<Order, T, D>, blocks_at_once(std::max<int64_t>(rows, w.marked ? 0 : table)),
-                   kThreads, 0, stream, a, w, table, rows);
+  if ((a.displacement && !a.fresh) || (!w.marked && !a.deterministic)) {
+    launch_at_once(activate_at_once<Order, T, D>, blocks_for(std::max<int64_t>(rows, w.marked ? 0 : table)), kThreads,
+                   0, stream, a, w, table, rows);
     return;
   }
   // No more listed tiles have to run at once than fit on the device.

@@ -1,3 +1,5 @@
+#include <cooperative_groups.h>
+
 #include "cuda/barrier.cuh"
 #include "cuda/launch.cuh"
 #include "heat/operator.cuh"
@@ -8,6 +10,8 @@
 // no further work, and the kernel ends with the last one. The host is not involved, and the kernel can be captured in a
 // graph.
 namespace mpm::cuda {
+
+namespace cg = cooperative_groups;
 
 // Threads of a block: for a solve as many as fit in a multiprocessor by their registers, so that few wait at barriers.
 template <int Order, class T>
@@ -270,7 +274,7 @@ __device__ void HeatKernel<Order, T, D>::start(WarpMemory<S>& memory) const {
   for_items(t, -1, [&](int i, int) {
     if (takes(scene_of_item(i))) pack_item<S>(t, x, conductance, items()[i], i, w.packed, memory);
   });
-  cuda::wait_for_all();
+  cg::this_grid().sync();
   for (int64_t scene = thread; scene < t.scenes; scene += threads) lay_out_parts(int(scene));
   if (has_theta(a)) sum_to<HeatSum::product>(StartValues<T, D>{a}, w.v.product, memory, all);
   if (a.method == HeatMethod::chebyshev)
@@ -417,7 +421,6 @@ __device__ void HeatKernel<Order, T, D>::finish() const {
 
 template <int Order, class T, int D>
 __global__ void __launch_bounds__(kHeatThreads<Order, T>, 1) heat_kernel(const HeatKernel<Order, T, D> kernel) {
-  grid_dependency_sync();
   extern __shared__ uint4 dynamic[];
   auto& own = reinterpret_cast<WarpMemory<HeatShape<Order, T, D>>*>(dynamic)[threadIdx.x / 32];
   if (!kernel.takes_any()) return;
@@ -429,20 +432,21 @@ __global__ void __launch_bounds__(kHeatThreads<Order, T>, 1) heat_kernel(const H
   kernel.finish();
 }
 
-// Thread blocks of a solve. With few particles a cluster is as fast, and only a cluster is launched in a chain.
-inline unsigned solve_blocks(int64_t most) {
-  const bool few = most <= 8 * int64_t(kLargestCluster);
-  return unsigned(std::min<int64_t>(most, few ? kLargestCluster : INT_MAX));
-}
-
 template <int Order, class T, int D>
 void heat_cg(const HeatArguments<T, D>& a, Stream stream) {
   const Topology<T, D>& t = a.topology;
   HeatKernel<Order, T, D> kernel(a);
   if (small_scenes(t)) solve_scenes<Order, T, D>({a, kernel.w.packed.particles, kernel.w.v, kernel.w.apart}, stream);
-  constexpr int threads = kHeatThreads<Order, T>;
-  constexpr size_t shared_memory = threads / 32 * sizeof(WarpMemory<HeatShape<Order, T, D>>);
-  launch_at_once(heat_kernel<Order, T, D>, solve_blocks(most_thread_blocks(t)), threads, shared_memory, stream, kernel);
+  constexpr int threads = kHeatThreads<Order, T>,
+                shared_memory = threads / 32 * sizeof(WarpMemory<HeatShape<Order, T, D>>);
+  const auto function = heat_kernel<Order, T, D>;
+  int resident = 0;
+  check(cudaFuncSetAttribute(function, cudaFuncAttributeMaxDynamicSharedMemorySize, shared_memory));
+  check(cudaOccupancyMaxActiveBlocksPerMultiprocessor(&resident, function, threads, shared_memory));
+  const unsigned blocks = unsigned(
+      std::min<int64_t>(most_thread_blocks(t), int64_t(device_attribute(cudaDevAttrMultiProcessorCount)) * resident));
+  void* arguments[] = {&kernel};
+  check(cudaLaunchCooperativeKernel(function, blocks, threads, arguments, shared_memory, stream));
 }
 
 template <class T, int D>
