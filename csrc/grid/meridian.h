@@ -73,8 +73,14 @@ class MeridianPoses {
   MeridianPose<T> pose_;
 };
 
-// Whether obstacle `inside` is such a body, with no wall that a foot of the node may be at, and the place of the node in
-// its plane. A node on the axis has many planes.
+// Without a call: it is short in a plane, and there is one place for it.
+template <class T>
+MPM_HD void compute_face(bool wanted, const MeridianPoses<T>& poses, const T& reach, Face<T, 2>& face, T& beyond) {
+  if (wanted) set_face(poses, reach, face, beyond);
+}
+
+// Whether obstacle `inside` is such a body, with no wall that a foot of the node may be at, and the place of the node
+// in its plane. A node on the axis has many planes.
 template <class Poses, class T>
 MPM_HD bool is_in_meridian(const Poses& poses, int inside, const Vector<T, 3>& x, Vector<T, 2>& place) {
   const auto& a = poses.a;

@@ -59,10 +59,11 @@ MPM_HD S edge_height(const ValueOf<S>* corner, int corners, int k, const Vector<
                      ValueOf<S>& beyond) {
   using T = ValueOf<S>;
   const T *const a = corner + 2 * k, *const b = end_of_edge(corner, corners, k);
-  const Vector<S, 2> edge = {{lift<S>(b[0] - a[0]), lift<S>(b[1] - a[1])}};
+  const Vector<T, 2> edge = {{b[0] - a[0], b[1] - a[1]}};
+  const T size = length(edge), inverse = size > T(0) ? T(1) / size : T(0);
   const Vector<S, 2> arm = {{p[0] - lift<S>(a[0]), p[1] - lift<S>(a[1])}};
-  normal = direction(Vector<S, 2>{{edge[1], S(0) - edge[0]}});
-  const T size = value_of(length(edge)), along = size > T(0) ? value_of(dot(arm, edge)) / size : T(0);
+  normal = {{lift<S>(inverse * edge[1]), lift<S>(T(0) - inverse * edge[0])}};
+  const T along = inverse * (value_of(arm[0]) * edge[0] + value_of(arm[1]) * edge[1]);
   beyond = along < T(0) ? T(0) - along : along > size ? along - size : T(0);
   if (size == T(0) || is_on_axis(a, b)) return S(std::numeric_limits<T>::max());
   return dot(arm, normal);

@@ -256,8 +256,7 @@ struct Face {
 
 // Sets what a point sees of a face, whose numbers and point `at` are given.
 template <class Poses, class T, int D>
-MPM_HD_CALL void compute_face(bool wanted, const Poses& poses, const T& reach, Face<T, D>& face, T& beyond) {
-  if (!wanted) return;
+MPM_HD void set_face(const Poses& poses, const T& reach, Face<T, D>& face, T& beyond) {
   const auto& pose = poses[face.obstacle];
   const Vector<T, D> body = to_body(pose, face.at);
   Vector<T, D> normal;
@@ -265,6 +264,11 @@ MPM_HD_CALL void compute_face(bool wanted, const Poses& poses, const T& reach, F
   face.normal = pose.rotation * normal;
   face.depth = T(0) - face.height;
   face.flat = is_flat(pose, face.face, body, reach);
+}
+
+template <class Poses, class T, int D>
+MPM_HD_CALL void compute_face(bool wanted, const Poses& poses, const T& reach, Face<T, D>& face, T& beyond) {
+  if (wanted) set_face(poses, reach, face, beyond);
 }
 
 template <class T, int D>

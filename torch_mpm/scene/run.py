@@ -39,7 +39,7 @@ SEGMENT = 32
 """Substeps between two checks of the stability limit and the validity of the state, and between two reorderings."""
 LONGEST_SEGMENT = {"cpu": SEGMENT, "cuda": 512}
 """The same while the limit is steady: a GPU waits at each check."""
-UNSTEADY_SEGMENT = {"cpu": SEGMENT, "cuda": 64}
+UNSTEADY_SEGMENT = {"cpu": SEGMENT, "cuda": 128}
 """The same while it is not; where it was exceeded, the substeps are recomputed in the shortest segments."""
 STEADY = 1.02
 """Largest factor by which a steady limit may decrease over a segment."""
