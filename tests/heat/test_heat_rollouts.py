@@ -302,6 +302,9 @@ REFUSED = {
     "flux of Flux is a function": lambda s: setattr(
         s.heat, "boundaries", [heat_boundaries.Flux(heat_boundaries.FreeSurface(), lambda t: 1.0)]
     ),
+    "has more than 15 terms": lambda s: setattr(
+        s.heat, "boundaries", [heat_boundaries.Convection(heat_boundaries.FreeSurface(), 1.0, 0.1)] * 16
+    ),
     "is no obstacle of the step": lambda s: setattr(
         s.heat, "boundaries", [heat_boundaries.Fixed(mpm.Sphere((0.4, 0.4), 0.1), 1.0)]
     ),

@@ -179,6 +179,8 @@ class FreeBodies:
             with aside(self.step, given.x):
                 return advance(start._replace(state=given), 1, 0).state
 
+        # The backward pass reads them again, when the caller may have written other ones to their memory.
+        wrenches = wrenches.clone() if wrenches is not None and steps.checkpoints is not None else wrenches
         start = _Moved(state, rows, rows.new_zeros(len(rows), 1 + len(self)))
         checkpoints = None
         if steps.checkpoints is not None and torch.is_grad_enabled():

@@ -28,8 +28,8 @@ from .sampling import NoRoom, content
 from .statistics import Motion
 
 AGAIN = 0.8
-"""Share of the largest limit of failed scenes that the time step of their second attempt has: the limit between two
-checks (`batch.LOOK`) may be smaller than at these."""
+"""Share of the smallest limit of failed scenes that the time step of their next attempt has: the limit between two checks
+(`batch.LOOK`) may be smaller than at these."""
 OnFrame = Callable[[int, int], None]
 """Function that is called with the number of simulated scenes and the number of the queued frame."""
 
@@ -177,7 +177,7 @@ def _of_next(count: int, most: int, share: float, is_last: bool) -> int:
         count: substeps per frame of the previous attempt, at most half of `most`.
         share: largest share of the limit that its time step had.
     """
-    return most if is_last or not share < math.inf else min(math.ceil(count * share / AGAIN), most)
+    return most if is_last or not share < math.inf else min(max(math.ceil(count * share / AGAIN), count + 1), most)
 
 
 def _substeps(

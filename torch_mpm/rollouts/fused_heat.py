@@ -52,6 +52,8 @@ NUMBERS: dict[type, tuple[str, ...]] = {
     Radiation: ("emissivity", "ambient"),
 }
 """Terms of the free surface, in the order of csrc/heat/transfer.h, and their numbers."""
+MOST_TERMS = 15
+"""Such terms in a call of the op: `kMostHeatTerms` in csrc/heat/transfer.h without that of heat from inside."""
 
 
 def _why_not_boundaries(step: Step, heat: Heat) -> str | None:
@@ -72,6 +74,8 @@ def _why_not_boundaries(step: Step, heat: Heat) -> str | None:
                 continue
             if value.shape not in ((), (1,), (heat.grid.scenes,)):
                 return f"{name} of {type(term).__name__} has other values than one for each scene"
+    if sum(type(term) in NUMBERS for term in terms) > MOST_TERMS:
+        return f"its heat has more than {MOST_TERMS} terms of the free surface"
     for kind, reason in ((FixedSurface, "several surfaces are held"), (Source, "there are several sources of heat")):
         if sum([type(term) is kind for term in terms]) > 1:
             return reason
