@@ -28,8 +28,8 @@ from .sampling import NoRoom, content
 from .statistics import Motion
 
 AGAIN = 0.8
-"""Share of the smallest limit of failed scenes that the time step of their next attempt has: the limit between two checks
-(`batch.LOOK`) may be smaller than at these."""
+"""Share of the smallest limit of failed scenes that the time step of their next attempt has: between two checks
+(`batch.LOOK`) the limit may be smaller than at these."""
 OnFrame = Callable[[int, int], None]
 """Function that is called with the number of simulated scenes and the number of the queued frame."""
 
