@@ -103,11 +103,7 @@ struct LoneContact {
 
   // Derivative of a component of the impulse by the velocity of the surface.
   MPM_HD Vector<T, D> slope(int axis) const {
-    Vector<T, D> unit;
-    MPM_UNROLL for (int i = 0; i < D; i++)
-      unit[i] = T(i == axis);
-    const Vector<T, D> kept = contact_adjoint(pose.contact, u, node.normal, pose.row->friction, unit);
-    return node.mass * (kept + T(-1) * unit);
+    return (T(0) - node.mass) * slope_of_change(pose.contact, u, node.normal, pose.row->friction, axis);
   }
 };
 

@@ -271,6 +271,17 @@ MPM_HD void changes_of_constraints(const Constraints<S, D>& c, const Vector<S, D
   }
 }
 
+// Derivative of a component of the change of a velocity by one surface, by the velocity of that; u is the velocity
+// relative to the surface.
+template <class T, int D>
+MPM_HD Vector<T, D> slope_of_change(Contact kind, const Vector<T, D>& u, const Vector<T, D>& normal, const T& friction,
+                                    int component) {
+  Vector<T, D> unit;
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    unit[i] = T(i == component);
+  return unit + T(-1) * contact_adjoint(kind, u, normal, friction, unit);
+}
+
 // Calls f(axis, slope) with the derivatives of these changes by the velocity, along each axis, of the surfaces that are
 // the bits of `moved`.
 template <class T, int D, class F>
@@ -293,18 +304,15 @@ MPM_HD void slopes_of_constraints(const Constraints<T, D>& c, const Vector<T, D>
   if (!(moved >> only & 1)) return;
   const Constraint<T, D>& surface = c.e[only];
   const Vector<T, D> u = v + T(-1) * surface.velocity;
-  MPM_LOOP for (int axis = 0; axis < D; axis++) {
-    // Row by row, as the adjoint has it.
-    MPM_UNROLL for (int i = 0; i < D; i++) {
-      Vector<T, D> unit;
-      MPM_UNROLL for (int j = 0; j < D; j++)
-        unit[j] = T(i == j);
-      const Vector<T, D> kept = contact_adjoint(surface.kind, u, surface.normal, surface.friction, unit);
-      T own = T(0);
-      MPM_UNROLL for (int j = 0; j < D; j++)
-        own = j == axis ? unit[j] - kept[j] : own;
-      slope[only][i] = own;
-    }
+  Matrix<T, D> by_axis;  // the transpose of the rows
+  MPM_UNROLL for (int i = 0; i < D; i++) {
+    const Vector<T, D> row = slope_of_change(surface.kind, u, surface.normal, surface.friction, i);
+    MPM_UNROLL for (int axis = 0; axis < D; axis++)
+      by_axis[axis][i] = row[axis];
+  }
+  MPM_UNROLL for (int axis = 0; axis < D; axis++) {
+    MPM_UNROLL for (int i = 0; i < D; i++)
+      slope[only][i] = by_axis[axis][i];
     f(axis, slope);
   }
 }
