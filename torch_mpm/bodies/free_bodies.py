@@ -13,7 +13,6 @@ are stable at the time step of the material.
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -32,7 +31,7 @@ from ..ops.contact import MAX_OBSTACLES, fusible, walls_beside
 from ..ops.free_bodies import BodyTables, body_tables
 from ..ops.obstacle_tables import values_without_motion
 from ..rollouts.budget import EVERYTHING, within_budget
-from ..rollouts.checkpoints import Checkpoints, as_checkpoints, from_python, offloaded
+from ..rollouts.checkpoints import Checkpoints, as_checkpoints, from_python, offloading
 from ..rollouts.facts import wants_gradient
 from ..rollouts.reasons import why_not_fused
 from ..rollouts.run import computed
@@ -188,7 +187,7 @@ class FreeBodies:
             checkpoints = within_budget(steps._replace(step=alone), start.state, fused=False)
         if checkpoints is None or checkpoints is EVERYTHING:
             return advance(start, steps.n, 0)
-        with offloaded(start.state) if checkpoints.offload else contextlib.nullcontext():
+        with offloading(checkpoints, start.state):
             return from_python(advance, start, steps.n, checkpoints, self.step)
 
     def _stepped(self, now: _Moved, dt: Any, wrenches: Tensor | None) -> _Moved:

@@ -339,8 +339,13 @@ def _calls(parts: int, states: int, in_op: bool) -> int:
 # ---- on the host
 
 
+def offloading(checkpoints: Checkpoints | None, state: State) -> contextlib.AbstractContextManager[None]:
+    """Context of `Checkpoints(offload=True)` for steps from a state; one without effect for other checkpoints."""
+    return _offloaded(state) if checkpoints is not None and checkpoints.offload else contextlib.nullcontext()
+
+
 @contextlib.contextmanager
-def offloaded(state: State) -> Iterator[None]:
+def _offloaded(state: State) -> Iterator[None]:
     """Context in which particle tensors on a CUDA device that autograd stores are moved to pinned host memory.
 
     Fields that steps do not change stay on the device, since all stored states share them. Copies are queued on the

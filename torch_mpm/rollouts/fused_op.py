@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from typing import Any
 
 import torch
@@ -22,7 +21,7 @@ from ..state.state import State, check_state
 from ..step.clocks import StepTimes, clocks, requires_grad, time_after
 from ..step.pause import paused
 from ..step.step import Step
-from .checkpoints import binomial, offloaded
+from .checkpoints import binomial, offloading
 from .facts import differentiates, follows_paths
 from .fused_heat import heat_arguments, heat_changes
 from .plan import SCHEDULES, RolloutPlan
@@ -53,7 +52,7 @@ def in_calls(steps: Steps, state: State, plan: RolloutPlan) -> State:
         return advance(state, n)
     if checkpoints is not None and checkpoints.states is not None and n > 0:
         return binomial(advance, step.prepare(state), n, checkpoints, step, in_op=True)
-    with offloaded(state) if checkpoints is not None and checkpoints.offload else contextlib.nullcontext():
+    with offloading(checkpoints, state):
         return advance(state, n)
 
 

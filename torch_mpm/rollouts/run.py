@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable
 from typing import Any
 
@@ -15,7 +14,7 @@ from ..state.state import State, check_state
 from ..step.step import Step
 from .anomaly import begin, detecting, watch
 from .budget import within_budget
-from .checkpoints import Checkpoints, as_checkpoints, from_python, offloaded
+from .checkpoints import Checkpoints, as_checkpoints, from_python, offloading
 from .fused_op import in_calls
 from .gradient_norms import GradientNorms
 from .graph_replay import replayed
@@ -180,7 +179,7 @@ def _from_python(steps: Steps, state: State, plan: RolloutPlan) -> State:
         state, steps, n = advance(state, 1, 0), steps.part(n - 1, 1), n - 1
     if isinstance(step, Step) and checkpoints is not None and n > 0:
         state = step.prepare(state)
-    with offloaded(state) if checkpoints is not None and checkpoints.offload else contextlib.nullcontext():
+    with offloading(checkpoints, state):
         return from_python(advance, state, n, checkpoints, step, plan.steps_per_call)
 
 
