@@ -18,7 +18,7 @@ On CUDA a step is one CUDA graph, as in the examples. The rigid solver is MuJoCo
 otherwise. On the CPU the grid is dense, since sparse grids of separate worlds need CUDA.
 
 What differs: Newton's water is incompressible and its steps are implicit, so that it needs one step where torch_mpm
-needs a dozen; its kernels are linear and those of torch_mpm quadratic, with 8 and 27 nodes per particle; it solves
+needs 7 to 24; its kernels are linear and those of torch_mpm quadratic, with 8 and 27 nodes per particle; it solves
 the bodies and the water one after another, torch_mpm together. Bodies meet the water alone, not each other. Particles,
 geometry, masses, joints, gravity, cell width and the time of a step are the same.
 

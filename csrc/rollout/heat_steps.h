@@ -67,8 +67,8 @@ class HeatSteps {
     backend::heat_volumes(a, stream);
   }
 
-  // Lets the transfer to the particles compute the volumes for the next substep, from F and J after this one, where G2P
-  // does not and begin() need not; on CUDA.
+  // Lets the transfer to the particles compute the volumes for the next substep, from F and J after this one; on CUDA.
+  // G2P computes them where it is joined, and begin() where laws heat the particles.
   void store_volumes(const Field<const T>& F, const Field<const T>& J, const Field<const T>& rest) {
     if (s_.with_heat.to_nodes.sums.pointer || heats_by_laws()) return;
     volumes_after_ = volumes_of(F, J, rest, fields.next(true));
