@@ -1,6 +1,7 @@
 """PPO on the tasks of `torch_mpm.envs`: returns before and after, and times.
 
-    python -m benchmarks.envs_ppo --processes 2     # a quarter of an hour on 2 cores
+    python -m benchmarks.envs_ppo --processes 2     # half an hour on 2 cores, without `write`
+    python -m benchmarks.envs_ppo --device cuda --processes 3
     python -m benchmarks.envs_ppo --quick           # seconds
 
 Each task is trained once by examples/learn_ppo.py, from seed 0, and tested without the noise of the training in as many
@@ -20,7 +21,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from . import common
+
+LARGE = ("write",)
+"""Tasks that need a GPU, with millions of particles in all scenes together."""
 
 
 def example() -> Any:
@@ -33,26 +39,28 @@ def example() -> Any:
     return learn_ppo
 
 
-def measure(names: Sequence[str], quick: bool, processes: int) -> dict[str, Any]:
-    """The tasks, in as many processes at a time, each with one thread."""
+def measure(names: Sequence[str], quick: bool, processes: int, device: str) -> dict[str, Any]:
+    """The tasks, in as many processes at a time, each with one thread; on "cuda" by all GPUs in turn."""
+    gpus = torch.cuda.device_count() if device == "cuda" else 1
     with common.one_thread():
-        environment = common.environment()
+        environment = common.environment(device, gpus)
+    places = [f"cuda:{k % gpus}" if device == "cuda" else device for k in range(len(names))]
     spawn = multiprocessing.get_context("spawn")
     with concurrent.futures.ProcessPoolExecutor(processes, spawn) as pool:
-        tasks = list(pool.map(functools.partial(measure_task, quick=quick), names))
+        tasks = list(pool.map(functools.partial(measure_task, quick=quick), names, places))
     return {"environment": environment | {"processes": processes}, "tasks": tasks}
 
 
-def measure_task(name: str, quick: bool) -> dict[str, Any]:
+def measure_task(name: str, device: str, quick: bool) -> dict[str, Any]:
     learn = example()
     training = learn.TRAININGS[name]
     if quick:
         training = training._replace(steps=240, scenes=2, steps_per_update=40)
     with common.one_thread():
         begin = time.perf_counter()
-        trained = learn.train(name, training)
+        trained = learn.train(name, training, device=device)
         seconds = time.perf_counter() - begin
-        network, first, best = learn.beside_the_plan(name, trained.policy, "cpu")
+        network, first, best = learn.beside_the_plan(name, trained.policy, device)
     result = {
         "name": name,
         "training": {
@@ -95,8 +103,13 @@ def table(result: dict[str, Any]) -> str:
 
 def text(result: dict[str, Any]) -> str:
     about = (__doc__ or "").split("\n\n", 2)[2].strip()
-    parts = ["# PPO", common.describe(result["environment"]), about, table(result), "![](envs_ppo.png)"]
+    picture = f"![]({file_name(result)}.png)"
+    parts = ["# PPO", common.describe(result["environment"]), about, table(result), picture]
     return "\n\n".join(parts)
+
+
+def file_name(result: dict[str, Any]) -> str:
+    return f"envs_ppo_{common.slug(result['environment']['device'])}"
 
 
 def plot(result: dict[str, Any], path: Path) -> None:
@@ -120,12 +133,15 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="few steps of one task, to see that it works")
     parser.add_argument("--tasks", nargs="+", choices=tuple(example().TRAININGS))
     parser.add_argument("--processes", type=int, default=1, help="tasks that are trained at a time")
+    parser.add_argument("--device", default="cpu", help="of the simulations")
     parser.add_argument("--out", type=Path, default=common.RESULTS)
     arguments = parser.parse_args()
-    names = arguments.tasks or (["push"] if arguments.quick else list(example().TRAININGS))
-    result = measure(names, arguments.quick, arguments.processes)
-    common.write(arguments.out, "envs_ppo", result, text(result))
-    plot(result, arguments.out / "envs_ppo.png")
+    large = arguments.device != "cpu"
+    chosen = ["push"] if arguments.quick else [name for name in example().TRAININGS if large or name not in LARGE]
+    result = measure(arguments.tasks or chosen, arguments.quick, arguments.processes, arguments.device)
+    name = file_name(result)
+    common.write(arguments.out, name, result, text(result))
+    plot(result, arguments.out / f"{name}.png")
 
 
 if __name__ == "__main__":

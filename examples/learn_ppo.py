@@ -25,14 +25,15 @@ from torch_mpm.envs.stable_baselines import StableBaselinesEnv
 
 
 class Training(NamedTuple):
-    """Steps of the environment, in all scenes together; number of scenes; steps of each scene before an update, and how
-    often the update uses each of them; rate of learning at the beginning, which falls to zero; discount of a step; and
-    logarithm of the standard deviation of the actions at the beginning."""
+    """Steps of the environment, in all scenes together; number of scenes; steps of each scene before an update, how
+    often the update uses each of them, and in how many batches; rate of learning at the beginning, which falls to zero;
+    discount of a step; and logarithm of the standard deviation of the actions at the beginning."""
 
     steps: int
     scenes: int = 16
     steps_per_update: int = 20
     epochs: int = 10
+    batches: int = 4
     learning_rate: float = 1e-3
     discount: float = 0.98
     log_deviation: float = -0.5
@@ -44,7 +45,7 @@ TRAININGS = {
     "pour": Training(80_000, learning_rate=5e-4, discount=0.99, log_deviation=-1.5),
     "scoop": Training(20_000, epochs=20),
     "lift": Training(30_000),
-    "write": Training(4_800, 8, epochs=20),
+    "write": Training(600_000, 256, batches=8),
 }
 TEST = 10**6  # seed of the first scene of the test
 HIDDEN = 64  # neurons of both hidden layers, as in the networks of stable-baselines3
@@ -167,7 +168,7 @@ def make_model(name: str, training: Training, seed: int, device: str) -> PPO:
         VecNormalize(VecMonitor(env), gamma=training.discount),
         learning_rate=lambda left: training.learning_rate * left,
         n_steps=training.steps_per_update,
-        batch_size=training.scenes * training.steps_per_update // 4,
+        batch_size=training.scenes * training.steps_per_update // training.batches,
         n_epochs=training.epochs,
         gamma=training.discount,
         policy_kwargs={"net_arch": [HIDDEN, HIDDEN], "log_std_init": training.log_deviation},

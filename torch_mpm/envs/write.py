@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -31,6 +33,7 @@ LETTERS = {
 }
 """Corners of the stroke of each letter on the floor [m]."""
 CORNERS = max(len(corners) for corners in LETTERS.values())
+POINTS = 12  # along the stroke of a letter, which the observation has
 
 
 class Write(MaterialEnv):
@@ -38,14 +41,14 @@ class Write(MaterialEnv):
 
     Action [3]: velocity of the stylus, in units of 1 m/s.
 
-    Observation [12]: position of the stylus [m], four corners of the stroke of the letter [m], and the score. The last
-    corner is repeated for a letter with fewer.
+    Observation [39]: position of the stylus [m], and for each of 12 points along the stroke of the letter the vector
+    on the floor to it from the stylus [m], and then the share of the clay around it that is left.
 
     Score: −(mean of max(z − 0.06 m, 0) (1 − d / r) over the particles with d < r), with the height z of a particle, its
     distance d from the stroke on the floor, and the radius r of the stylus; over its first absolute value. It is −1 for
     flat clay, and zero where the groove is free of clay.
 
-    Success: the score is above −0.4.
+    Success: the score is above −0.5. A stylus that follows the letter once leaves 0.4 of the clay in the groove.
 
     Seeds choose the letter, I, L, V or Z, and the position of the stylus above the clay.
 
@@ -55,8 +58,8 @@ class Write(MaterialEnv):
         options: see `MaterialEnv`.
     """
 
-    ACTIONS, OBSERVATIONS, RANDOM, MAX_EPISODE_STEPS = 3, 4 + 2 * CORNERS, 3, 100
-    SPEED, FREE = 1.0, 0.4
+    ACTIONS, OBSERVATIONS, RANDOM, MAX_EPISODE_STEPS = 3, 3 + 3 * POINTS, 3, 100
+    SPEED, MOST_LEFT = 1.0, 0.5
 
     def __init__(self, num_envs: int = 1, dx: float = 0.04, **options: Any) -> None:
         self.grid = Grid(dx, (0.0, 0.0, 0.0), UPPER, scenes=num_envs, deterministic=True)
@@ -70,30 +73,61 @@ class Write(MaterialEnv):
         return State.at_rest(self.points, density=1000.0, dtype=self.dtype, device=self.device)
 
     def scenes(self, random: Tensor) -> Scenes:
-        letters = tuple(stroke + stroke[-1:] * (CORNERS - len(stroke)) for stroke in LETTERS.values())
-        stroke = self.constant(letters)[(random[:, 0] * len(letters)).long()]
-        left = clay_left(self.first.x[None], stroke)
+        letter = (random[:, 0] * len(LETTERS)).long()
         x, y = (0.3 + 0.2 * random[:, 1:]).unbind(1)
         poses = self.columns(x, y, CLAY + 1.1 * (RADIUS + HALF), 1.0, 0.0, 0.0, 0.0)[:, None]
-        return Scenes(poses, torch.cat([stroke.flatten(1), left[:, None]], 1))
+        return Scenes(poses, self.letters[letter])
+
+    @cached_property
+    def letters(self) -> Tensor:
+        """Numbers of the goal of each letter [L, G]; `parts` has their meaning."""
+        strokes = tuple(stroke + stroke[-1:] * (CORNERS - len(stroke)) for stroke in LETTERS.values())
+        stroke, points = self.constant(strokes), self.constant(tuple(map(points_along, LETTERS.values())))
+        x = self.first.x[None]
+        return torch.cat(
+            [stroke.flatten(1), points.flatten(1), clay_left(x, stroke)[:, None], clay_around(x, points)], 1
+        )
+
+    def parts(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Corners of the stroke of each scene [B, N, 2], and points along it [B, M, 2] [m]; and the clay at the
+        beginning in the groove [B], and around the points [B, M] [m]."""
+        stroke, points, groove, around = self.goal.split([2 * CORNERS, 2 * POINTS, 1, POINTS], 1)
+        return stroke.unflatten(1, (CORNERS, 2)), points.unflatten(1, (POINTS, 2)), groove[:, 0], around
 
     def velocities(self, actions: Tensor) -> Tensor:
         velocity = self.within(self.SPEED * actions[:, None], LOWEST, HIGHEST)
         return torch.cat([velocity, torch.zeros_like(velocity)], 2)
 
     def observation(self) -> Tensor:
-        return torch.cat([self.positions[:, 0], self.goal[:, :-1], self.score()[:, None]], 1)
+        _, points, _, before = self.parts()
+        stylus = self.positions[:, 0]
+        to_points = (points - stylus[:, None, :2]).flatten(1)
+        return torch.cat([stylus, to_points, clay_around(self.envs.observe("x"), points) / before], 1)
 
     def score(self) -> Tensor:
-        stroke = self.goal[:, :-1].unflatten(1, (CORNERS, 2))
-        return -clay_left(self.envs.observe("x"), stroke) / self.goal[:, -1]
+        stroke, _, before, _ = self.parts()
+        return -clay_left(self.envs.observe("x"), stroke) / before
 
     def success(self) -> Tensor:
-        return self.score() > -self.FREE
+        return self.score() > -self.MOST_LEFT
 
     def lines(self, b: int) -> list[Any]:
-        corners = self.goal[b, :-1].reshape(CORNERS, 2).cpu().numpy()
+        corners = self.parts()[0][b].cpu().numpy()
         return [(np.concatenate([corners, np.full((CORNERS, 1), CLAY)], 1), "red", "letter")]
+
+
+def points_along(corners: Sequence[tuple[float, float]]) -> tuple[tuple[float, float], ...]:
+    """The middles of parts of equal length of a stroke, POINTS of them."""
+    stroke = np.asarray(corners)
+    ends = np.concatenate([[0.0], np.hypot(*np.diff(stroke, axis=0).T).cumsum()])
+    middles = (np.arange(POINTS) + 0.5) / POINTS * ends[-1]
+    x, y = (np.interp(middles, ends, axis).tolist() for axis in stroke.T)
+    return tuple(zip(x, y, strict=True))
+
+
+def clay_around(x: Tensor, points: Tensor) -> Tensor:
+    """Clay that is left around points [B, M, 2] on the floor [B, M] [m]: that of strokes which stay at them."""
+    return torch.stack([clay_left(x, point[:, None].expand(-1, 2, -1)) for point in points.unbind(1)], 1)
 
 
 def clay_left(x: Tensor, stroke: Tensor) -> Tensor:
