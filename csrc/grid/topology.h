@@ -29,7 +29,8 @@ constexpr int kOutOfBlockCost = 2, kOutOfBlockCostWithHeat = 64;
 struct Displacement {
   int out_of_block;  // particles out of the block that they had then
   int lost;          // whether one touches, or may soon touch, a block that is not active: bits of Loss
-  int earlier;       // the same, accumulated over the previous steps
+  int earlier;       // particles out of their block, accumulated over the previous steps
+  int requested;     // whether the step after the next one needs an activation
 
   // kMissed: P2G of the same kernel has already missed a particle.
   enum Loss : int { kLost = 1, kMissed = 2 };
@@ -41,7 +42,7 @@ struct Displacement {
     return lost == 0 && (int64_t(earlier) + out_of_block) * out_of_block_cost <= particles;
   }
   MPM_HD Displacement next(int64_t particles, int out_of_block_cost) const {
-    return {0, 0, lasts(particles, out_of_block_cost) ? earlier + out_of_block : 0};
+    return {0, 0, lasts(particles, out_of_block_cost) ? earlier + out_of_block : 0, 0};
   }
 };
 

@@ -9,16 +9,17 @@
 namespace mpm::cuda {
 namespace {
 
-template <int Order_, class T_, int D_>
+// Without Moves, P2G or the laws update F, J and the volumes.
+template <int Order_, class T_, int D_, bool Moves>
 struct HeatAdvance {
   using T = T_;
   static constexpr int Order = Order_, D = D_;
   using Source = HeatSource<Order, T, D>;
   using Shape = typename Source::Shape;
-  using Motion = AdvanceGather<Order, T, D, false, true>;
+  using Motion = AdvanceGather<Order, T, D, false, true, Moves>;
   static constexpr int threads = Shape::threads, most = kSmallItemParticles<D>;  // of an item
   // Thread blocks of a multiprocessor at once, which limits registers.
-  static constexpr int resident = Order != 2 || sizeof(T) != 4 ? 1 : D == 2 ? 9 : 3;
+  static constexpr int resident = Order != 2 || sizeof(T) != 4 ? 1 : D == 2 ? 9 : Moves ? 3 : 4;
   static constexpr bool quads = D == 3;  // the rows of the grid of a rollout are whole vectors then
   struct Loaded {
     typename Motion::Loaded motion;
@@ -42,12 +43,13 @@ struct HeatAdvance {
     if (packs) packed = packed_in(a.workspace, a.to_nodes.topology, false);
   }
 
-  __device__ Loaded load(int p, int scene) const { return {motion.load(p, scene), heat.read(p, scene), rest.at(p)}; }
+  __device__ Loaded load(int p, int scene) const {
+    return {motion.load(p, scene), heat.read(p, scene), Moves ? rest.at(p) : T(0)};
+  }
   __device__ Written write(int p, const Loaded& l, const typename Motion::Result& sums) const {
     Written w;
-    T rate;
-    w.x = motion.write(p, p, p, l.motion, sums, [&](const Matrix<T, D>& L, const Matrix<T, D>& F, const T& J) {
-      rate = strain_rate_of(L);
+    const T rate = strain_rate_of(motion.motion(sums).affine);  // of the form MLS
+    w.x = motion.write(p, p, p, l.motion, sums, [&](const Matrix<T, D>&, const Matrix<T, D>& F, const T& J) {
       volume_next.at(p) = l.rest * (motion.J_next.present() ? J : motion.F_next.present() ? determinant(F) : T(1));
     });
     w.of_nodes = heat.contribution(p, l.heat, rate, w.weights);
@@ -56,7 +58,7 @@ struct HeatAdvance {
   __device__ void skip(int p) const {
     motion.skip(p);
     heat.skip(p, p);
-    volume_next.at(p) = heat.volume.at(p);
+    if (Moves) volume_next.at(p) = heat.volume.at(p);
   }
 };
 
@@ -223,6 +225,13 @@ __global__ void __launch_bounds__(K::threads, K::resident) advance_kernel(const 
   follower.flush_counters(k.motion.displacement);
 }
 
+template <class K, class T, int D>
+void launch_advance(const HeatAdvanceArguments<T, D>& a, int64_t items, Stream stream) {
+  constexpr size_t dynamic = K::Shape::shared_bytes;
+  static_assert(dynamic + sizeof(AdvanceMemory<K>) <= 99 * 1024);
+  launch_in_chain(advance_kernel<K>, grid_size(items), K::threads, dynamic, stream, K(a));
+}
+
 }  // namespace
 
 template <int Order, class T, int D>
@@ -231,10 +240,10 @@ void heat_advance(const HeatAdvanceArguments<T, D>& a, Stream stream) {
   const int64_t items = most_items(t.max_blocks, t.particles);
   if (items == 0) return;
   if constexpr (kAdvancesHeat<T, D>) {
-    using Kernel = HeatAdvance<Order, T, D>;
-    constexpr size_t dynamic = Kernel::Shape::shared_bytes;
-    static_assert(dynamic + sizeof(AdvanceMemory<Kernel>) <= 99 * 1024);
-    launch_in_chain(advance_kernel<Kernel>, grid_size(items), Kernel::threads, dynamic, stream, Kernel(a));
+    constexpr bool has_fused_laws = Order == 2 && sizeof(T) == sizeof(float);
+    if constexpr (has_fused_laws)
+      if (a.advance.late) return launch_advance<HeatAdvance<Order, T, D, false>>(a, items, stream);
+    launch_advance<HeatAdvance<Order, T, D, true>>(a, items, stream);
   } else {
     throw std::logic_error("G2P of the motion and P2G of heat have no kernel in float64 in 3-D");
   }

@@ -10,7 +10,7 @@ namespace {
 
 __host__ __device__ inline void request_activation([[maybe_unused]] Displacement* displacement) {
 #ifdef __CUDA_ARCH__
-  atomicOr(&displacement->lost, Displacement::kLost);
+  displacement->requested = 1;
 #endif
 }
 
@@ -40,7 +40,7 @@ MPM_HD void begin_node(const HeatNodesArguments<T, D>& a, int64_t i) {
 // Work at a scene: i < scenes.
 template <class T, int D>
 MPM_HD void finish_scene(const HeatFinishArguments<T, D>& a, int64_t scene) {
-  constexpr double kGrowth = 2;  // of the bound, within a substep
+  constexpr double kGrowth = 2;  // of the bound, until the activation
   const HeatArguments<T, D>& solve = a.simple.solve;
   if (a.displacement && simple_steps_of(kGrowth * bound_of_scene(solve, int(scene)), solve.relative_tolerance) == 0)
     request_activation(a.displacement);

@@ -65,7 +65,7 @@ struct HeatAdvanceArguments {
   G2PAdvanceArguments<T, D> advance;
   HeatToNodesArguments<T, D> to_nodes;
   Field<const T> rest;
-  Field<T> volume_next;
+  Field<T> volume_next;       // unless P2G or laws update F and J
   void* workspace = nullptr;  // of the solve; may be absent
 };
 
@@ -222,8 +222,9 @@ struct HeatFinishArguments {
   T* sums = nullptr;         // where w θ is replaced by the change of the temperature; may be absent
   T* increment = nullptr;    // may be absent
   HeatCleared<T> cleared;
-  double* status = nullptr;              // [scenes, kHeatStatusSize]
-  Displacement* displacement = nullptr;  // requests an activation where a scene may soon need more; may be absent
+  double* status = nullptr;  // [scenes, kHeatStatusSize]
+  // Counters of the substep, where an activation is requested if a scene may soon need more; may be absent.
+  Displacement* displacement = nullptr;
 };
 
 // Adds the solves of a substep to the status of the scenes.

@@ -26,8 +26,8 @@ int given_history_entries(const LawArguments<T, D>& law) {
 }
 
 // Momentum of particles whose stress is computed as they are loaded, and stored where it has a destination. Where
-// requested, F or J is updated first if the previous G2P has deferred the update.
-template <class Law, class T, int D, bool MayMove>
+// requested, F or J is updated first if the previous G2P has deferred the update, and the present volume is stored.
+template <class Law, class T, int D, bool MayMove, bool StoresVolume = false>
 struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true, false> {
   using Base = MomentumSource<2, T, D, Stress::moment, true, false>;
   using Kernels = typename Law::template Kernels<Law>;
@@ -38,6 +38,8 @@ struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true, false> 
   Columns<const T, moves_F ? D * D : 1> state;  // F or J, as given
   Columns<T, moves_F ? D * D : 1> kept;         // and their destination; optional
   int kept_entries;                             // of the history
+  Columns<const T, 1> rest;
+  Columns<T, 1> volume;  // present volume, optional
 
   // Result of the law at a particle.
   struct Changes {
@@ -55,7 +57,9 @@ struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true, false> 
         late(late),
         state(law.law.state, D),
         kept(Law::plastic ? law.state : late.state, D),
-        kept_entries(law.history.pointer ? given_history_entries<Law>(law.law) : 0) {}
+        kept_entries(law.history.pointer ? given_history_entries<Law>(law.law) : 0),
+        rest(a.volume),
+        volume(late.volume) {}
 
   // Inputs of the law at a particle, except its history.
   __device__ void fetch(int p, Changes& changes) const {
@@ -84,10 +88,12 @@ struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true, false> 
     if (Law::viscous && Base::fields.affine.present()) a.law.C = {&C[0][0], {0, D, 1}};
     if constexpr (moves_F) {
       if (late.moves) changes.F = advance_deformation(changes.F, C, dt);
+      if (StoresVolume && volume.present()) volume.at(p) = rest.at(p) * determinant(changes.F);
       a.law.state = {&changes.F[0][0], {0, D, 1}};
       if (Law::plastic) a.state = {&changes.F[0][0], {0, D, 1}};
     } else {
       if (late.moves) changes.J = advance_volume_ratio(changes.J, C, dt);
+      if (StoresVolume && volume.present()) volume.at(p) = rest.at(p) * changes.J;
       a.law.state = {&changes.J, {0}};
     }
     if (entries > 0 && law.history.pointer) a.history = {changes.history, {0, 1}};
@@ -155,16 +161,20 @@ struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true, false> 
 
 // The same for particles that P2G also moves into the order of its items, if the call owns them.
 template <class Law, class T, int D>
-struct ReorderingSource : LawMomentumSource<Law, T, D, true> {
-  using Base = LawMomentumSource<Law, T, D, true>;
+struct ReorderingSource : LawMomentumSource<Law, T, D, true, true> {
+  using Base = LawMomentumSource<Law, T, D, true, true>;
   ReorderOnScatter<T, D> reorder;
+  LastingActivation only;
 
   ReorderingSource(const P2GArguments<T, D>& a, const LawUpdateArguments<T, D>& law, const LateDeformation<T, D>& late,
                    const ReorderOnScatter<T, D>& reorder)
-      : Base(a, law, late), reorder(reorder) {}
+      : Base(a, law, late), reorder(reorder), only(a.only) {}
 
-  bool is_mostly_idle() const { return reorder.rows > 0 && reorder.is_mostly_idle(); }
-  __device__ bool is_due() const { return reorder.rows == 0 || reorder.is_due(Base::topology.particles); }
+  bool is_mostly_idle() const { return reorder.rows > 0 ? reorder.is_mostly_idle() : only.displacement && !only.lasts; }
+  __device__ bool is_due() const {
+    const int64_t particles = Base::topology.particles;
+    return reorder.rows > 0 ? reorder.is_due(particles) : only.is_given(particles);
+  }
   __device__ bool reorders() const { return reorder.rows > 0; }
   __device__ ParticleMomentum<T, D> load(int p, int scene, int place) const {
     ParticleMomentum<T, D> m = Base::read(p, scene, reorder.rows ? reorder.place(p) : p);

@@ -75,15 +75,15 @@ class HeatSteps {
     has_volumes_ = true;
   }
 
-  // Lets G2P of the substep compute P2G of heat, and the volumes for the next substep; on CUDA in a call whose
-  // activations last. Sums on deterministic grids have an order.
+  // Lets G2P of the substep compute P2G of heat, and the volumes for the next substep unless P2G or laws do; on CUDA in
+  // a call whose activations last. Sums on deterministic grids have an order.
   void join_g2p(const Field<const T>& x, const Field<const T>& mass, const Field<const T>& velocity_gradient,
                 backend::Stream stream) {
     if (!kAdvancesHeat<T, D> || !s_.displacements.defined() || in_.lattice.deterministic()) return;
     HeatAdvanceArguments<T, D>& a = s_.with_heat;
     a.to_nodes = begin_nodes(x, mass, velocity_gradient, stream);
     a.rest = s_.p2g.volume;
-    a.volume_next = column(fields.next(true), volume_);
+    a.volume_next = s_.advance.late ? Field<T>{} : column(fields.next(true), volume_);
     a.workspace = packs_in_g2p() ? workspace(stream) : nullptr;
     has_volumes_ = true;
   }
@@ -141,7 +141,7 @@ class HeatSteps {
            (in.heat_boundaries.empty() || in.heat_boundaries[kPower].numel() == 0);
   }
 
-  // Where G2P stores the present volumes of the next substep.
+  // Where the present volumes are stored.
   Field<T> volumes() { return column(fields.next(false), volume_); }
 
   // The first columns of the fields, which a call returns and a step reads.
@@ -667,7 +667,7 @@ void HeatSteps<T, D>::solve(HeatArguments<T, D>& a, backend::Stream stream) {
   if (for_record_) finish.increment = a.increment;
   if (solves_for_sums()) finish.cleared = next_cleared();
   finish.status = rows_of_status();
-  finish.displacement = s_.advance.displacement;
+  finish.displacement = s_.counters;
   solve_simply(in_.lattice.order(), finish, stream);
 }
 

@@ -123,7 +123,9 @@ __global__ void __launch_bounds__(kThreads, kLeastBlocks<Obstacles, T>)
   }
   grid_dependency_sync();
   if (blockIdx.x == 0 && threadIdx.x == 0) {
-    *a.next_displacement = a.displacement->next(a.particles, a.out_of_block_cost);
+    Displacement next = a.displacement->next(a.particles, a.out_of_block_cost);
+    if (a.next_displacement->requested) next.lost = Displacement::kLost;
+    *a.next_displacement = next;
     if (a.items_taken) *a.items_taken = 0;
   }
   SeveralNodes several;

@@ -71,6 +71,10 @@ constexpr int64_t kLeastFusedSteps = 4, kLeastFusedParticles = 1 << 18;
 // then G2P can pass over them in the order of memory, but P2G cannot.
 constexpr int64_t kMostLateParticles = 1 << 18;
 
+// Particles whose P2G runs beside the solve of heat of the substep before, which leaves multiprocessors idle. Of more
+// particles each kernel fills the device, and the second launch of P2G costs more.
+constexpr int64_t kMostParticlesAhead = 1 << 17;
+
 // Persistent. For a deterministic grid, or a pool of fixed size, half as many particles.
 constexpr int64_t kLeastPersistentSteps = 10, kMostPersistentParticles = 1 << 15, kMostPersistentBlocks = 256;
 // Largest number of particles of an item, with a thread each. It grows with the number of particles, so that one wave

@@ -46,6 +46,7 @@ struct Substeps {
   Tensor stress = absent(), step_time = absent();
   Tensor scene_time = absent();                         // the time of each scene now, where each has its own
   Tensor displacements = absent();                      // counters of two substeps in turn, if activations last
+  Displacement* counters = nullptr;                     // those of the substep
   Tensor largest_mass = absent();                       // of a particle, where sums are fixed
   NextGridArguments<T, D> next;                         // with `update` and `contact` of this struct
   Tensor known_nodes = absent(), known = absent();      // see ContactArguments
@@ -89,11 +90,16 @@ struct Substeps {
   // (`has_left`), and G2P defers the update to the next P2G, except in the last substep.
   void move_late(const Particles<T>& p, bool has_left, bool last) {
     const bool is_F = calls[0].law->info.field == Deformation::gradient;
-    const Field<T>& state = is_F ? p.F : p.J;
-    late = {state, has_left, activation.scene, activation.scene_stride};
+    late = {is_F ? p.F : p.J, has_left, activation.scene, activation.scene_stride};
+    defer(p, last);
+  }
+  // G2P leaves F and J of `p` for the next substep to update, and updates them in place in the last one.
+  void defer(const Particles<T>& p, bool last) {
     advance.late = !last;
-    (is_F ? advance.F : advance.J) = constant(state);
-    (is_F ? advance.F_next : advance.J_next) = state;
+    advance.F = constant(p.F);
+    advance.J = constant(p.J);
+    advance.F_next = p.F;
+    advance.J_next = p.J;
   }
 
   // Sets the destinations of the results.
@@ -220,10 +226,10 @@ struct Substeps {
   }
 
   // Whether P2G updates F or J. It needs the affine field and a kernel of the law; particles stay in place in memory.
-  // Heat reads F and J after G2P.
+  // G2P with heat processes items as P2G does, and passes over particles in no better order.
   bool moves_late() const {
-    return fused && displacements.defined() && in.apic && facts.one_deformation && in.heat.empty() &&
-           in.x.size(0) <= kMostLateParticles;
+    return fused && displacements.defined() && in.apic && facts.one_deformation &&
+           (!in.heat.empty() || in.x.size(0) <= kMostLateParticles);
   }
 
   void forget_stress() {
@@ -235,11 +241,12 @@ struct Substeps {
   // blocks at the end.
   void swap_buffers(int parity, bool last) {
     if (!displacements.defined()) return;
-    Displacement* const displacement = static_cast<Displacement*>(displacements.data_ptr());
-    activation.displacement = last ? nullptr : displacement + parity;
-    next.displacement = displacement + parity;
-    next.next_displacement = advance.displacement = displacement + (1 - parity);
+    counters = counters_of(parity);
+    activation.displacement = last ? nullptr : counters;
+    next.displacement = counters;
+    next.next_displacement = advance.displacement = counters_of(1 - parity);
   }
+  Displacement* counters_of(int parity) const { return static_cast<Displacement*>(displacements.data_ptr()) + parity; }
 
   // Accumulates the time of obstacles as single steps do; on a device, which may run ahead of the host.
   void count_time([[maybe_unused]] const int* status_before, [[maybe_unused]] backend::Stream stream) {

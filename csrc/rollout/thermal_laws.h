@@ -1,8 +1,8 @@
 #pragma once
 
-#include "common/lanes.h"
 #include "laws/law.h"
 #include "pointwise/thermal.h"
+#include "transfer/advance.h"
 
 // Laws of temperature in many substeps, at one particle: before the laws of a material their parameters, F and J
 // without expansion, and those of both phases; after them the stress, F and J of the material
@@ -24,6 +24,15 @@ struct TableParameter {
   T* to = nullptr;  // [P]
 };
 
+// Update of F and J that G2P defers to the laws, which read and write them anyway.
+template <class T, int D>
+struct DeferredMotion {
+  bool moves = false;              // whether a G2P has deferred one
+  AdvanceArguments<T, D> advance;  // its results are F and J, possibly in place; absent where G2P updates them
+  Field<const T> rest;             // volume
+  Field<T> volume;                 // present volume after the update; absent where there was none
+};
+
 // A material, whose only law is that of the solid where it does not melt.
 template <class T, int D>
 struct ThermalLawsArguments {
@@ -36,6 +45,7 @@ struct ThermalLawsArguments {
   // F and J of the material, and those that laws read; those are absent where laws read those of the material.
   Field<const T> F, J;
   Field<T> elastic_F, elastic_J;
+  DeferredMotion<T, D> deferred;
   bool is_plastic = false;  // the law of the solid
   // F and J after the laws, in place of those before, absent where laws do not change them; stress of the material, and
   // of the liquid where it melts; energy that the solid dissipates, absent where it is not wanted.
@@ -93,6 +103,33 @@ MPM_HD bool changes_F(const ThermalLawsArguments<T, D>& a, const One<T>& at) {
   return a.next_F.pointer && (a.is_plastic || has_collapsed(a, at));
 }
 
+// The affine field of the deferred motion times its time step. Particles without a finite position, or of no scene, are
+// unchanged.
+template <class T, int D>
+MPM_HD Matrix<T, D> deferred_change(const DeferredMotion<T, D>& deferred, const One<T>& at) {
+  const AdvanceArguments<T, D>& a = deferred.advance;
+  const int64_t scene = a.scene ? a.scene[at.p * a.scene_stride] : 0;
+  const bool moves = scene >= 0 && scene < a.scenes && is_finite<D>(load_vector<D>(at, a.x).e);
+  if (!deferred.moves || !moves) return zero_matrix<T, D>();
+  return particle_dt(a, at) * load_matrix<D>(at, a.affine);
+}
+
+// F and J of a particle after the update that G2P has deferred, which are stored.
+template <class T, int D>
+MPM_HD Phases<T, D> load_moved(const ThermalLawsArguments<T, D>& a, const One<T>& at) {
+  Phases<T, D> moved{T(1), zero_matrix<T, D>()};
+  if (a.elastic_F.pointer) moved.F = load_matrix<D>(at, a.F);
+  if (a.elastic_J.pointer) moved.J = load_scalar(at, a.J);
+  const Field<T>&F = a.deferred.advance.F_next, &J = a.deferred.advance.J_next, &volume = a.deferred.volume;
+  if (!F.pointer && !J.pointer) return moved;
+  const Matrix<T, D> change = deferred_change(a.deferred, at);
+  if (F.pointer) store_matrix<D>(at, F, moved.F = advance_deformation(moved.F, change, T(1)));
+  if (J.pointer) store_scalar(at, J, moved.J = advance_volume_ratio(moved.J, change, T(1)));
+  if (volume.pointer)
+    store_scalar(at, volume, load_scalar(at, a.deferred.rest) * (J.pointer ? moved.J : determinant(moved.F)));
+  return moved;
+}
+
 template <class T, int D>
 MPM_HD void begin_laws_of(const ThermalLawsArguments<T, D>& a, int64_t p) {
   if (!a.members.has(p)) return;
@@ -101,9 +138,9 @@ MPM_HD void begin_laws_of(const ThermalLawsArguments<T, D>& a, int64_t p) {
     a.parameters[k].to[p] = value_at(a.parameters[k].table, load_scalar(at, a.theta));
   if (!a.has_elastic()) return;
   const T factor = T(1) / stretch_of(a, at);
-  Phases<T, D> phases{T(1), zero_matrix<T, D>()};
-  if (a.elastic_F.pointer) phases.F = factor * load_matrix<D>(at, a.F);
-  if (a.elastic_J.pointer) phases.J = volume_of_stretch<D>(factor) * load_scalar(at, a.J);
+  Phases<T, D> phases = load_moved(a, at);
+  phases.F = factor * phases.F;
+  phases.J = volume_of_stretch<D>(factor) * phases.J;
   if (a.coherency.knots > 0) phases = phases_of(phases.J, phases.F, load_scalar(at, a.fraction), a.coherency.value[0]);
   if (a.elastic_F.pointer) store_matrix<D>(at, a.elastic_F, phases.F);
   if (a.elastic_J.pointer) store_scalar(at, a.elastic_J, phases.J);

@@ -113,6 +113,32 @@ class ThermalLaws {
     }
   }
 
+  // Whether the laws of a call can update F and J in place of G2P: those of a material of all particles, which read F
+  // and J without expansion, or those of both phases.
+  bool may_move() const {
+    const ThermalLawsArguments<T, D>& a = materials_[0];
+    const bool alone = count() == size_t(has_liquid(0) ? 2 : 1) && !has(s_.in.material);
+    return alone && bool(a.elastic_F.pointer) == has(s_.in.F) && bool(a.elastic_J.pointer) == has(s_.in.J);
+  }
+
+  // Lets the laws update F and J of the particles `to`, if a G2P has deferred that (`has_left`), and store the present
+  // volumes then.
+  void move_late(const Particles<T>& to, bool has_left, const Field<T>& volume) {
+    DeferredMotion<T, D>& d = materials_[0].deferred;
+    d.moves = has_left;
+    d.advance.x = s_.p2g.x;
+    d.advance.affine = s_.p2g.affine;
+    d.advance.scene = s_.activation.scene;
+    d.advance.scene_stride = s_.activation.scene_stride;
+    d.advance.scene_dt = s_.p2g.scene_dt;
+    d.advance.scenes = s_.in.scenes;
+    d.advance.dt = s_.in.dt;
+    d.advance.F_next = to.F;
+    d.advance.J_next = to.J;
+    d.rest = s_.p2g.volume;
+    d.volume = has_left ? volume : Field<T>{};
+  }
+
   // Computes what laws read: the parameters by tables at the present temperatures, F and J.
   void begin(backend::Stream stream) const {
     for (const ThermalLawsArguments<T, D>& a : materials_)

@@ -48,7 +48,7 @@ struct G2PAdvanceArguments {
   double dt = 0;
   StressForm form = StressForm::mls;
   Field<T> x_next, F_next, J_next, residual_next;
-  bool late = false;  // F and J are updated by P2G, where there is a LateDeformation; on CUDA
+  bool late = false;  // F and J are updated by P2G (LateDeformation) or by laws (DeferredMotion); on CUDA
   // On CUDA: particles may be in active blocks other than those of the activation, and their new places are counted
   // here.
   Displacement* displacement = nullptr;
@@ -65,6 +65,7 @@ struct LateDeformation {
   bool moves = false;          // whether a G2P has deferred an update
   const int* scene = nullptr;  // [P], where scenes have time steps of their own
   int64_t scene_stride = 0;
+  Field<T> volume;  // result after the update: present volume; absent where it is not needed
 };
 
 inline namespace TORCH_MPM_ISA {

@@ -103,6 +103,21 @@ def test_particles_leave_their_blocks(dim, scenes, stiff, device):
     compare(step, state.replace(x=x, v=state.v + moving), 40, tolerance=1e-6 if stiff else 1e-9)
 
 
+PLACES = {("dim", "scenes", "with_boundaries"): [(2, 1, True), (3, 1, False), (2, 3, False), (3, 1, True)]}
+
+
+@pytest.mark.parametrize(*in_pairs(PLACES, law=LAWS, n=[2, 3, 4, 17, 40], cells=[0.01, 0.1]))
+def test_steps_that_begin_during_the_solve(law, scenes, with_boundaries, cells, dim, n, device):
+    """On CUDA, P2G of the next substep runs beside the solve unless particles have moved too far, and updates F: for
+    calls just long enough, with graphs and without, and with activations in between."""
+    step, state = scene(dim, torch.float32, scenes, law, max_blocks=scenes * 3**dim, device=device)
+    if with_boundaries:
+        step = held(step, (heat_boundaries.FixedSurface, bodies(dim)["sphere"], 40.0))
+        step.heat.boundaries = [*step.heat.boundaries.entries, *terms()["convection"]]
+    moving = cells * step.grid.dx / DT * torch.linspace(-1, 1, dim).to(state.x)
+    compare(step, state.replace(v=0.1 * state.v + moving), n, tolerance=1e-3)
+
+
 @pytest.mark.parametrize("deterministic", [False, True])
 @pytest.mark.parametrize("kernel", ["quadratic", "cubic"])
 def test_crowded_blocks(dim, kernel, deterministic, device):

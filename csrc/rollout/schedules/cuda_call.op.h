@@ -2,6 +2,7 @@
 
 #include "common/signals.h"
 #include "cuda/graph.h"
+#include "cuda/side_stream.h"
 #include "rollout/heat_steps.h"
 #include "rollout/schedules/block_per_scene.op.h"
 #include "rollout/schedules/fused_g2p2g.op.h"
@@ -72,6 +73,9 @@ class CudaCall {
   Particles<const T> from_;      // inputs of the next substep
   const int* before_ = nullptr;  // status before it
   bool late_ = false;            // whether F and J are updated in place
+  bool laws_move_ = false;       // whether laws of temperature do that, before they are evaluated
+  bool goes_ahead_ = false;      // whether P2G runs beside the solve of heat of the substep before
+  bool is_ahead_ = false;        // whether it has for the next substep, unless an activation is due
   int64_t step_ = 0;             // computed substeps
   int last_ = 0;                 // index of the buffer with the results of the last one
 
@@ -116,7 +120,9 @@ class CudaCall {
   // The second buffers, for schedules with a substep at a time.
   void make_buffers() {
     const bool several = in_.n > 1;
-    late_ = s_.moves_late();
+    laws_move_ = thermal_ && thermal_->may_move() && s_.displacements.defined() && in_.apic && s_.facts.quadratic &&
+                 s_.facts.float32;
+    late_ = laws_move_ || s_.moves_late();
     x_[1] = result(in_.x, several, {P(), D});
     F_[1] = late_ ? F_[0] : result(in_.x, has(in_.F) && (several || s_.plastic), {P(), D, D});
     J_[1] = late_ ? J_[0] : result(in_.x, has(in_.J) && (several || s_.melts), {P()});
@@ -124,34 +130,66 @@ class CudaCall {
       torch::stable::copy_(F_[1], *in_.F);
       from_.F = field<const T>(F_[1]);
     }
-    if (s_.melts) {
+    if (s_.melts && !late_) {
       torch::stable::copy_(J_[1], *in_.J);
       from_.J = field<const T>(J_[1]);
     }
   }
 
+  // Sets the particles of a substep from one of the two buffers into the other.
+  void set_particles(int into, bool has_left, bool last) {
+    s_.read(from_, field<T>(F_[1 - into]));
+    s_.write(buffers(into));
+    if (laws_move_) return s_.defer(buffers(into), last);
+    if (!late_) return;
+    s_.move_late(buffers(into), has_left, last);
+    if (heat_ && has_left) s_.late.volume = heat_->volumes();
+  }
+
   // One substep from one of the two buffers into the other.
   void substep(int into, bool last, backend::Stream on) {
     s_.swap_buffers(into, last);
-    s_.read(from_, field<T>(F_[1 - into]));
+    set_particles(into, step_ > 0, last);
     const Particles<T> to = buffers(into);
-    s_.write(to);
     if (heat_ && heat_->heats_by_laws()) s_.dissipate(heat_->dissipated());
     if (thermal_) thermal_->read(field<T>(F_[1 - into]), field<T>(J_[1 - into]));
-    if (late_) s_.move_late(to, step_ > 0, last);
+    if (laws_move_) thermal_->move_late(to, step_ > 0, heat_->volumes());
     s_.activate(before_, status(into), on);
     if (heat_ && heat_->begins()) heat_->begin(from_.F, from_.J, s_.p2g.volume, on);
     thermal_ ? thermal_->run(on) : s_.run_laws(on);
     if (heat_) heat_->join_g2p(from_.x, s_.p2g.mass, constant(to.C), on);
+    if (is_ahead_) s_.p2g.only = {s_.counters, s_.activation.out_of_block_cost, false};
     s_.move(on);
-    if (heat_) {
-      const Field<const int> scene{s_.activation.scene, {s_.activation.scene_stride}};
-      heat_->store_volumes(constant(to.F), constant(to.J), s_.p2g.volume);
-      heat_->run(from_.x, s_.p2g.mass, s_.p2g.volume, constant(to.C), scene, on);
+    s_.p2g.only = {};
+    // The last substep has an activation of its own.
+    is_ahead_ = goes_ahead_ && step_ + 2 < in_.n;
+    if (is_ahead_) {
+      SideStream& side = SideStream::of_this_thread();
+      conduct(to, side.after(on));
+      from_ = constant(to);
+      begin_next(1 - into, on);
+      side.join(on);
+    } else if (heat_) {
+      conduct(to, on);
     }
     s_.end_time(on);
     before_ = status(into);
     from_ = constant(to);
+  }
+
+  // Heat of the substep to the particles `to`.
+  void conduct(const Particles<T>& to, backend::Stream on) {
+    const Field<const int> scene{s_.activation.scene, {s_.activation.scene_stride}};
+    heat_->store_volumes(constant(to.F), constant(to.J), s_.p2g.volume);
+    heat_->run(from_.x, s_.p2g.mass, s_.p2g.volume, constant(to.C), scene, on);
+  }
+
+  // P2G of the next substep, where the activation lasts.
+  void begin_next(int into, backend::Stream on) {
+    set_particles(into, true, false);
+    s_.p2g.only = {s_.counters_of(into), s_.activation.out_of_block_cost, true};
+    s_.fused_kernels.p2g(s_.laws[0], s_.late, s_.p2g, s_.reorder, on);
+    s_.p2g.only = {};
   }
 
   // The first substep, those that last in activations, and the last one. False, after the first one, if the device
@@ -179,13 +217,16 @@ class CudaCall {
 
   // Computes the substeps from `step_` on. A CUDA graph repeats pairs of them.
   void run_per_step() {
+    goes_ahead_ = heat_ && s_.fused && s_.displacements.defined() && s_.next.emptied && !s_.facts.captured &&
+                  P() <= kMostParticlesAhead;
+    const int64_t after = goes_ahead_ ? 2 : 1;  // substeps that have no P2G ahead of the next one
     while (step_ < in_.n) {
       last_ = int(step_ % 2);
       substep(last_, step_ + 1 == in_.n, stream_);
       after_substeps(P(), 1, stream_);
       if (++step_ == 2) {
         const auto two = [&](backend::Stream on) { substep(0, false, on), substep(1, false, on); };
-        step_ += 2 * replay((in_.n - step_ - 1) / 2, stream_, two, [&] { after_substeps(P(), 2, stream_); });
+        step_ += 2 * replay((in_.n - step_ - after) / 2, stream_, two, [&] { after_substeps(P(), 2, stream_); });
       }
     }
   }
