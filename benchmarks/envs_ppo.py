@@ -53,7 +53,7 @@ def measure(names: Sequence[str], quick: bool, processes: int, device: str) -> d
 
 def measure_task(name: str, device: str, quick: bool) -> dict[str, Any]:
     learn = example()
-    training = learn.TRAININGS[name]
+    training = learn.training_on(device, name)
     if quick:
         training = training._replace(steps=240, scenes=2, steps_per_update=40)
     with common.one_thread():

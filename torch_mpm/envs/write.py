@@ -126,8 +126,10 @@ def points_along(corners: Sequence[tuple[float, float]]) -> tuple[tuple[float, f
 
 
 def clay_around(x: Tensor, points: Tensor) -> Tensor:
-    """Clay that is left around points [B, M, 2] on the floor [B, M] [m]: that of strokes which stay at them."""
-    return torch.stack([clay_left(x, point[:, None].expand(-1, 2, -1)) for point in points.unbind(1)], 1)
+    """Clay that is left around points [B, M, 2] on the floor [B, M] [m], for positions [B, R, 3]."""
+    height = (x[..., 2] - BOTTOM).clamp_min(0.0)
+    distances = (norm(x[..., :2] - point[:, None]) for point in points.unbind(1))  # One by one, to need less memory.
+    return torch.stack([mean_of_groove(height, distance) for distance in distances], 1)
 
 
 def clay_left(x: Tensor, stroke: Tensor) -> Tensor:
@@ -137,4 +139,10 @@ def clay_left(x: Tensor, stroke: Tensor) -> Tensor:
     length = along.square().sum(-1)
     share = ((arm * along).sum(-1) / torch.where(length > 0, length, 1.0)).clamp(0.0, 1.0)
     distance = norm(arm - share[..., None] * along).amin(2)
-    return ((x[..., 2] - BOTTOM).clamp_min(0.0) * (1 - distance / RADIUS).clamp_min(0.0)).mean(1)
+    return mean_of_groove((x[..., 2] - BOTTOM).clamp_min(0.0), distance)
+
+
+def mean_of_groove(height: Tensor, distance: Tensor) -> Tensor:
+    """Mean height above the groove [B] [m], which falls with the distance from its middle to zero at the radius of the
+    stylus; for heights and distances [B, R] [m]."""
+    return (height * (1 - distance / RADIUS).clamp_min(0.0)).mean(1)
