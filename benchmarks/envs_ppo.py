@@ -6,7 +6,8 @@
 
 Each task is trained once by examples/learn_ppo.py, from seed 0, and tested without the noise of the training in as many
 scenes that the training has not seen. A return is the sum of the rewards of an episode. The plans are the first guess
-and the best one by gradients of examples/plan_tasks.py, for the scene of seed 0 alone.
+and the best one by gradients of examples/plan_tasks.py, for the scene of seed 0 alone. Tasks that are not chosen keep
+their rows.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ def measure(names: Sequence[str], quick: bool, processes: int, device: str) -> d
 
 def measure_task(name: str, device: str, quick: bool) -> dict[str, Any]:
     learn = example()
-    training = learn.training_on(device, name)
+    training = learn.TRAININGS[name]
     if quick:
         training = training._replace(steps=240, scenes=2, steps_per_update=40)
     with common.one_thread():
@@ -63,6 +64,7 @@ def measure_task(name: str, device: str, quick: bool) -> dict[str, Any]:
         network, first, best = learn.beside_the_plan(name, trained.policy, device)
     result = {
         "name": name,
+        "commit": common.commit(),
         "training": {
             "steps": trained.steps,
             "scenes": training.scenes,
@@ -85,17 +87,25 @@ def measure_task(name: str, device: str, quick: bool) -> dict[str, Any]:
     return result
 
 
+def with_others(tasks: list[dict[str, Any]], earlier: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Tasks, and those of earlier results that are not among them, in the order of the example."""
+    known = {task["name"]: task for result in earlier for task in result["tasks"]} | {
+        task["name"]: task for task in tasks
+    }
+    return [known[name] for name in example().TRAININGS if name in known]
+
+
 def table(result: dict[str, Any]) -> str:
     header = (
-        "task", "steps", "scenes", "untrained", "trained", "deviation", "success", "trained, scene 0",
+        "task", "commit", "steps", "scenes", "untrained", "trained", "deviation", "success", "trained, scene 0",
         "first plan, scene 0", "best plan, scene 0", "failed", "time [s]",
     )  # fmt: skip
     rows = []
     for task in result["tasks"]:
         test, training = task["test"], task["training"]
         rows.append((
-            *(task["name"], training["steps"], training["scenes"], test["untrained"], test["trained"]),
-            *(test["deviation"], test["success"], *task["scene 0"].values()),
+            *(task["name"], task["commit"][:8], training["steps"], training["scenes"]),
+            *(test["untrained"], test["trained"], test["deviation"], test["success"], *task["scene 0"].values()),
             *(training["failed"], training["seconds"]),
         ))  # fmt: skip
     return common.table(header, rows)
@@ -140,6 +150,8 @@ def main() -> None:
     chosen = ["push"] if arguments.quick else [name for name in example().TRAININGS if large or name not in LARGE]
     result = measure(arguments.tasks or chosen, arguments.quick, arguments.processes, arguments.device)
     name = file_name(result)
+    if arguments.tasks:
+        result["tasks"] = with_others(result["tasks"], common.read(arguments.out, f"{name}.json"))
     common.write(arguments.out, name, result, text(result))
     plot(result, arguments.out / f"{name}.png")
 

@@ -47,17 +47,8 @@ TRAININGS = {
     "lift": Training(30_000),
     "write": Training(600_000, 256, batches=8),
 }
-MOST_SCENES = 64  # up to which a GPU takes about as long
 TEST = 10**6  # seed of the first scene of the test
 HIDDEN = 64  # neurons of both hidden layers, as in the networks of stable-baselines3
-
-
-def training_on(device: str, name: str) -> Training:
-    """On a GPU four times the scenes and steps, where it takes about as long: the result depends less on chance."""
-    training = TRAININGS[name]
-    if torch.device(device).type == "cpu" or 4 * training.scenes > MOST_SCENES:
-        return training
-    return training._replace(steps=4 * training.steps, scenes=4 * training.scenes)
 
 
 class Episode(NamedTuple):
@@ -247,7 +238,6 @@ def arguments(given: Sequence[str] | None = None) -> argparse.Namespace:
 if __name__ == "__main__":
     torch.set_num_threads(1)  # A few thousand particles: more threads would only wait for each other.
     options, begin = arguments(), time.perf_counter()
-    training = training_on(options.device, options.task)
     chosen = {key: getattr(options, key) for key in ("steps", "scenes") if getattr(options, key) is not None}
-    main(options.task, options.out, training._replace(**chosen), options.seed, options.device)
+    main(options.task, options.out, TRAININGS[options.task]._replace(**chosen), options.seed, options.device)
     print(f"{time.perf_counter() - begin:.0f} s; see {options.out / options.task}.png")

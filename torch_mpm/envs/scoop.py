@@ -62,7 +62,7 @@ class Scoop(MaterialEnv):
         return State.at_rest(self.points, density=1600.0, dtype=self.dtype, device=self.device)
 
     def scenes(self, random: Tensor) -> Scenes:
-        return Scenes(self.columns(0.4 + 0.2 * random[:, 0], 0.6, -0.5 * math.pi)[:, None])
+        return Scenes(self.columns(0.4 + 0.2 * random[:, 0], 0.45, -0.5 * math.pi)[:, None])
 
     def velocities(self, actions: Tensor) -> Tensor:
         velocity = self.within(self.SPEED * actions[:, None, :2], LOWEST, HIGHEST)
