@@ -187,7 +187,7 @@ def learning(results: list[dict[str, Any]]) -> str:
         "The return is the sum of the rewards of an episode: in m, but for `write`, where 1 is all of the clay in the "
         "groove.\n"
         "Columns of the test are means over scenes that the training has not seen, and the deviation among them; "
-        "success is the share of scenes that reach their goal.\n"
+        "success is the share of scenes that reach their goal; the commit is that of the measurement.\n"
         "The plans are for one scene, in which the trained network is tested too: the first guess, and the best one by "
         "gradients."
     )
@@ -682,7 +682,7 @@ def documents(directory: Path) -> dict[Path, str]:
     details = "\n\n".join(f"### {title}\n\n{text}" for title, text in sections(directory).items())
     measured = details.replace("](benchmarks/", "](../benchmarks/")
     costs = implicit_costs(common.read(directory, "implicit_cost_*.json"))
-    by_ppo = learning(common.read(directory, "envs_ppo.json"))
+    by_ppo = learning(common.read(directory, "envs_ppo_*.json"))
     pages = {README: overview(directory), MEASURED: measured, IMPLICIT: costs, ENVS: by_ppo}
     return pages | migrating(directory)
 

@@ -1,5 +1,7 @@
 #pragma once
 
+#include <vector>
+
 #include "common/backend.h"
 
 // Work beside that of a stream: a second stream of the thread, which the first one waits for.
@@ -7,38 +9,47 @@ namespace mpm {
 
 class SideStream {
  public:
-  static SideStream& of_this_thread() {
-    static thread_local SideStream* const side = new SideStream;  // never destroyed: CUDA may be unloaded before
-    side->use_device();
-    return *side;
-  }
+  // The second stream while it works beside `stream`: its work begins after the present work of that stream, whose work
+  // after the end of the fork begins after that of the second stream.
+  class Fork {
+   public:
+    explicit Fork(cudaStream_t stream) : stream_(stream), side_(of_this_thread()) {
+      check(cudaEventRecord(side_.event_, stream_));
+      check(cudaStreamWaitEvent(side_.stream_, side_.event_, 0));
+    }
+    Fork(const Fork&) = delete;
+    Fork& operator=(const Fork&) = delete;
+    ~Fork() {  // The calls fail only after another error, which is reported.
+      cudaEventRecord(side_.event_, side_.stream_);
+      cudaStreamWaitEvent(stream_, side_.event_, 0);
+    }
 
-  // The second stream, whose later work begins after the present work of `stream`.
-  cudaStream_t after(cudaStream_t stream) {
-    check(cudaEventRecord(event_, stream));
-    check(cudaStreamWaitEvent(stream_, event_, 0));
-    return stream_;
-  }
+    cudaStream_t stream() const { return side_.stream_; }
 
-  // Lets later work of `stream` begin after the present work of the second stream.
-  void join(cudaStream_t stream) {
-    check(cudaEventRecord(event_, stream_));
-    check(cudaStreamWaitEvent(stream, event_, 0));
-  }
+   private:
+    const cudaStream_t stream_;
+    const SideStream& side_;
+  };
 
  private:
-  static void check(cudaError_t error) { STD_TORCH_CHECK(error == cudaSuccess, "CUDA: ", cudaGetErrorString(error)); }
-
-  void use_device() {
-    int device = 0;
-    check(cudaGetDevice(&device));
-    if (device == device_) return;
-    check(cudaStreamCreateWithFlags(&stream_, cudaStreamNonBlocking));  // those of other devices remain, a few
+  SideStream() {
+    check(cudaStreamCreateWithFlags(&stream_, cudaStreamNonBlocking));
     check(cudaEventCreateWithFlags(&event_, cudaEventDisableTiming));
-    device_ = device;
   }
 
-  int device_ = -1;
+  static const SideStream& of_this_thread() {
+    // By device; never destroyed: CUDA may be unloaded before.
+    static thread_local auto* const streams = new std::vector<const SideStream*>;
+    int device = 0;
+    check(cudaGetDevice(&device));
+    if (streams->size() <= size_t(device)) streams->resize(size_t(device) + 1);
+    const SideStream*& own = (*streams)[size_t(device)];
+    if (!own) own = new SideStream;
+    return *own;
+  }
+
+  static void check(cudaError_t error) { STD_TORCH_CHECK(error == cudaSuccess, "CUDA: ", cudaGetErrorString(error)); }
+
   cudaStream_t stream_ = nullptr;
   cudaEvent_t event_ = nullptr;
 };

@@ -30,7 +30,7 @@ struct Displacement {
   int out_of_block;  // particles out of the block that they had then
   int lost;          // whether one touches, or may soon touch, a block that is not active: bits of Loss
   int earlier;       // particles out of their block, accumulated over the previous steps
-  int requested;     // whether the step after the next one needs an activation
+  int requested;     // whether the activation two steps later is needed
 
   // kMissed: P2G of the same kernel has already missed a particle.
   enum Loss : int { kLost = 1, kMissed = 2 };

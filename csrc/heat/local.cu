@@ -8,9 +8,11 @@
 namespace mpm::cuda {
 namespace {
 
-__host__ __device__ inline void request_activation([[maybe_unused]] Displacement* displacement) {
-#ifdef __CUDA_ARCH__
+__host__ __device__ inline void request_activations(Displacement* displacement,
+                                                    [[maybe_unused]] Displacement* next_displacement) {
   displacement->requested = 1;
+#ifdef __CUDA_ARCH__
+  if (next_displacement) atomicOr(&next_displacement->lost, Displacement::kLost);
 #endif
 }
 
@@ -43,7 +45,7 @@ MPM_HD void finish_scene(const HeatFinishArguments<T, D>& a, int64_t scene) {
   constexpr double kGrowth = 2;  // of the bound, until the activation
   const HeatArguments<T, D>& solve = a.simple.solve;
   if (a.displacement && simple_steps_of(kGrowth * bound_of_scene(solve, int(scene)), solve.relative_tolerance) == 0)
-    request_activation(a.displacement);
+    request_activations(a.displacement, a.next_displacement);
   if (simple_steps(solve, int(scene)) == 0) count_solve(count_of(a), scene);
 }
 

@@ -223,8 +223,9 @@ struct HeatFinishArguments {
   T* increment = nullptr;    // may be absent
   HeatCleared<T> cleared;
   double* status = nullptr;  // [scenes, kHeatStatusSize]
-  // Counters of the substep, where an activation is requested if a scene may soon need more; may be absent.
-  Displacement* displacement = nullptr;
+  // Counters of the substep and of the next one, where activations are requested if a scene may soon need more. Absent
+  // are both without activations that last, and the latter where P2G of the next substep may have begun.
+  Displacement *displacement = nullptr, *next_displacement = nullptr;
 };
 
 // Adds the solves of a substep to the status of the scenes.

@@ -164,16 +164,18 @@ template <class Law, class T, int D>
 struct ReorderingSource : LawMomentumSource<Law, T, D, true, true> {
   using Base = LawMomentumSource<Law, T, D, true, true>;
   ReorderOnScatter<T, D> reorder;
-  LastingActivation only;
+  WorkOfLaunch work;
 
   ReorderingSource(const P2GArguments<T, D>& a, const LawUpdateArguments<T, D>& law, const LateDeformation<T, D>& late,
                    const ReorderOnScatter<T, D>& reorder)
-      : Base(a, law, late), reorder(reorder), only(a.only) {}
+      : Base(a, law, late), reorder(reorder), work(a.work) {}
 
-  bool is_mostly_idle() const { return reorder.rows > 0 ? reorder.is_mostly_idle() : only.displacement && !only.lasts; }
+  bool is_mostly_idle() const {
+    return reorder.rows > 0 ? reorder.is_mostly_idle() : work.displacement && !work.where_it_lasts;
+  }
   __device__ bool is_due() const {
     const int64_t particles = Base::topology.particles;
-    return reorder.rows > 0 ? reorder.is_due(particles) : only.is_given(particles);
+    return reorder.rows > 0 ? reorder.is_due(particles) : work.is_due(particles);
   }
   __device__ bool reorders() const { return reorder.rows > 0; }
   __device__ ParticleMomentum<T, D> load(int p, int scene, int place) const {

@@ -57,7 +57,7 @@ class HeatSteps {
   // Steps leave nothing for an adjoint: neither increments nor averages of the nodes.
   void leave_no_record() { for_record_ = false; }
 
-  // Whether begin() is needed: G2P has not stored the present volumes, or laws store what they dissipate.
+  // Whether begin() is needed: the present volumes are not stored yet, or laws store what they dissipate.
   bool begins() const { return !has_volumes_ || heats_by_laws(); }
 
   // Computes the present volumes; before laws change F.
@@ -668,6 +668,7 @@ void HeatSteps<T, D>::solve(HeatArguments<T, D>& a, backend::Stream stream) {
   if (solves_for_sums()) finish.cleared = next_cleared();
   finish.status = rows_of_status();
   finish.displacement = s_.counters;
+  if (!s_.p2g_is_ahead) finish.next_displacement = s_.advance.displacement;
   solve_simply(in_.lattice.order(), finish, stream);
 }
 

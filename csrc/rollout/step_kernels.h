@@ -44,11 +44,12 @@ struct Substeps {
   HeatAdvanceArguments<T, D> with_heat;  // with `advance` of this struct; without node sums: not together
   Pool<T, D> pool;
   Tensor stress = absent(), step_time = absent();
-  Tensor scene_time = absent();                         // the time of each scene now, where each has its own
-  Tensor displacements = absent();                      // counters of two substeps in turn, if activations last
-  Displacement* counters = nullptr;                     // those of the substep
-  Tensor largest_mass = absent();                       // of a particle, where sums are fixed
-  NextGridArguments<T, D> next;                         // with `update` and `contact` of this struct
+  Tensor scene_time = absent();      // the time of each scene now, where each has its own
+  Tensor displacements = absent();   // counters of two substeps in turn, if activations last
+  Displacement* counters = nullptr;  // those of the substep
+  bool p2g_is_ahead = false;         // whether P2G of the next substep is launched beside the solve of heat
+  Tensor largest_mass = absent();    // of a particle, where sums are fixed
+  NextGridArguments<T, D> next;      // with `update` and `contact` of this struct
   Tensor known_nodes = absent(), known = absent();      // see ContactArguments
   std::shared_ptr<void> known_slots;                    // on the CPU, see contact.cpu.cpp
   std::optional<BodiesCall<T, D>> bodies;               // free bodies, which move after the obstacles act

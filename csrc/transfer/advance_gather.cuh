@@ -11,7 +11,7 @@ struct Motion {
   Matrix<T, D> affine;
 };
 
-// G2P with the end of the step, so that v and C need not be read again. Without Move, P2G updates F and J.
+// G2P with the end of the step, so that v and C need not be read again. Without Moves, P2G or laws update F and J.
 template <int Order_, class T_, int D_, bool Gradient, bool Displaced, bool Moves = true>
 struct AdvanceGather {
   using T = T_;

@@ -8,14 +8,14 @@
 // Arguments of the transfer kernels.
 namespace mpm {
 
-// On CUDA: which of two launches of the P2G of a step has work, by whether the activation lasts.
-struct LastingActivation {
-  const Displacement* displacement = nullptr;  // absent: an only launch
+// On CUDA, for P2G with the law: one of two launches of a step has work, by whether the activation lasts.
+struct WorkOfLaunch {
+  const Displacement* displacement = nullptr;  // absent: there is one launch, which has work
   int out_of_block_cost = kOutOfBlockCost;
-  bool lasts = false;
+  bool where_it_lasts = false;
 
-  MPM_HD bool is_given(int64_t particles) const {
-    return !displacement || displacement->lasts(particles, out_of_block_cost) == lasts;
+  MPM_HD bool is_due(int64_t particles) const {
+    return !displacement || displacement->lasts(particles, out_of_block_cost) == where_it_lasts;
   }
 };
 
@@ -30,7 +30,7 @@ struct P2GArguments {
   bool displaced = false;  // particles may be in active blocks other than those of the activation; with stress, on CUDA
   NodeField<T> nodes;      // zero on entry; 1 + D channels: mass, momentum
   FixedPoint fixed;        // sums of the nodes, on CUDA
-  LastingActivation only;  // when there is work
+  WorkOfLaunch work;
 };
 
 // ∂Φ/∂x_p of the trilinear form Φ = Σ_p Σ_i g_i · [N_i (value_p + scale moment_p (x_i − x_p)) + gradient_p ∇N_i], which

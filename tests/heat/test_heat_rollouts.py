@@ -116,8 +116,25 @@ def test_steps_that_begin_during_the_solve(law, scenes, with_boundaries, cells, 
     if with_boundaries:
         step = held(step, (heat_boundaries.FixedSurface, bodies(dim)["sphere"], 40.0))
         step.heat.boundaries = [*step.heat.boundaries.entries, *terms()["convection"]]
-    moving = cells * step.grid.dx / DT * torch.linspace(-1, 1, dim).to(state.x)
-    compare(step, state.replace(v=0.1 * state.v + moving), n, tolerance=1e-3)
+    x = state.x.clone()
+    x[3] = 5.0  # outside
+    moving = cells * step.grid.dx / DT * torch.linspace(-1, 1, dim).to(x)
+    dt = torch.linspace(1, 2, scenes) * DT if scenes > 1 else DT
+    compare(step, state.replace(x=x, v=0.1 * state.v + moving), n, dt, tolerance=1e-3)
+
+
+@pytest.mark.parametrize("n", [2, 3, 4, 5])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_few_particles_leave_their_blocks_at_once(dim, dtype, n, device):
+    """A sixty-fourth of the particles, in the first substep, so that the activation lasts unless the solve of conjugate
+    gradients, which needs all of them in their blocks, requests another one."""
+    step, state = scene(dim, dtype, max_blocks=3**dim, device=device)
+    step.heat.conductivity = 2e5
+    x, few = state.x.clone(), len(state) // 64
+    x[:few, 0] = 4.5 * step.grid.dx - 1e-4  # just before the nodes of the next block
+    v = torch.zeros_like(state.v)
+    v[:, 0] = 0.02 * step.grid.dx / DT
+    compare(step, state.replace(x=x, v=v), n, tolerance=1e-6 if dtype == torch.float64 else 1e-3)
 
 
 @pytest.mark.parametrize("deterministic", [False, True])
@@ -356,6 +373,16 @@ def test_laws_that_read_the_temperature(dim, name, device):
     assert relative_error(end.v, cold.v) > 1e-6
     if "melting" in name or name == "wax":
         assert 0 < float((end.extra["liquid"] > 0.5).double().mean()) < 1
+
+
+@pytest.mark.parametrize(*in_pairs(name=THERMAL, n=[2, 3, 4, 17], scenes=[1, 3], dim=[2, 3]))
+def test_laws_of_temperature_in_float32(name, n, scenes, dim, device):
+    """On CUDA they update F and J. Scenes have time steps of their own, and a particle is outside the grid."""
+    step, state = thermal([name], dim, torch.float32, scenes, device=device)
+    x = state.x.clone()
+    x[3] = 5.0
+    dt = torch.linspace(1, 2, scenes) * DT if scenes > 1 else DT
+    compare(step, state.replace(x=x), n, dt, tolerance=1e-3)
 
 
 @pytest.mark.parametrize("seed", range(20))

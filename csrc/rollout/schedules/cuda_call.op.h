@@ -75,7 +75,6 @@ class CudaCall {
   bool late_ = false;            // whether F and J are updated in place
   bool laws_move_ = false;       // whether laws of temperature do that, before they are evaluated
   bool goes_ahead_ = false;      // whether P2G runs beside the solve of heat of the substep before
-  bool is_ahead_ = false;        // whether it has for the next substep, unless an activation is due
   int64_t step_ = 0;             // computed substeps
   int last_ = 0;                 // index of the buffer with the results of the last one
 
@@ -158,17 +157,17 @@ class CudaCall {
     if (heat_ && heat_->begins()) heat_->begin(from_.F, from_.J, s_.p2g.volume, on);
     thermal_ ? thermal_->run(on) : s_.run_laws(on);
     if (heat_) heat_->join_g2p(from_.x, s_.p2g.mass, constant(to.C), on);
-    if (is_ahead_) s_.p2g.only = {s_.counters, s_.activation.out_of_block_cost, false};
+    if (s_.p2g_is_ahead) s_.p2g.work = {s_.counters, s_.activation.out_of_block_cost, false};
     s_.move(on);
-    s_.p2g.only = {};
-    // The last substep has an activation of its own.
-    is_ahead_ = goes_ahead_ && step_ + 2 < in_.n;
-    if (is_ahead_) {
-      SideStream& side = SideStream::of_this_thread();
-      conduct(to, side.after(on));
+    s_.p2g.work = {};
+    // Not in the first substep, whose solve may request an activation at once, nor before the last one, which has an
+    // activation of its own.
+    s_.p2g_is_ahead = goes_ahead_ && step_ > 0 && step_ + 2 < in_.n;
+    if (s_.p2g_is_ahead) {
+      const SideStream::Fork side(on);
+      conduct(to, side.stream());
       from_ = constant(to);
       begin_next(1 - into, on);
-      side.join(on);
     } else if (heat_) {
       conduct(to, on);
     }
@@ -187,9 +186,9 @@ class CudaCall {
   // P2G of the next substep, where the activation lasts.
   void begin_next(int into, backend::Stream on) {
     set_particles(into, true, false);
-    s_.p2g.only = {s_.counters_of(into), s_.activation.out_of_block_cost, true};
+    s_.p2g.work = {s_.counters_of(into), s_.activation.out_of_block_cost, true};
     s_.fused_kernels.p2g(s_.laws[0], s_.late, s_.p2g, s_.reorder, on);
-    s_.p2g.only = {};
+    s_.p2g.work = {};
   }
 
   // The first substep, those that last in activations, and the last one. False, after the first one, if the device
