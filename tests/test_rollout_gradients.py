@@ -430,7 +430,7 @@ def test_the_raw_ops(device):
     grads = [torch.randn_like(t) for t in torch.ops.torch_mpm.substeps(*call)[:6] if t is not None]
     adjoint = ([*grads[:4], None, grads[4], torch.ones_like(call[41]), None], 15, None, *call)
     torch.library.opcheck(torch.ops.torch_mpm.substeps_backward.default, adjoint, raise_exception=True)
-    with pytest.raises(RuntimeError, match=r"grad_x must have shape \[40, 2\]"):
+    with pytest.raises(RuntimeError, match=r"grads\[0\] must have shape \[40, 2\]"):
         torch.ops.torch_mpm.substeps_backward([grads[0][:3], *adjoint[0][1:]], *adjoint[1:])
     with pytest.raises(RuntimeError, match="grads must have 8 entries, got 6"):
         torch.ops.torch_mpm.substeps_backward(adjoint[0][:6], *adjoint[1:])

@@ -259,16 +259,16 @@ HeatSteps<T, D>::HeatSteps(Substeps<T, D>& steps) : s_(steps), in_(steps.in) {
   STD_TORCH_CHECK(in_.heat_options.size() == 3, "heat_options must have 3 entries, got ", in_.heat_options.size());
   STD_TORCH_CHECK(in_.heat_scalars.size() == 4, "heat_scalars must have 4 entries, got ", in_.heat_scalars.size());
   STD_TORCH_CHECK(in_.heat_scalars[2] >= 0 && in_.heat_scalars[2] <= 1,
-                  "the share of plastic heating must be 0 to 1, got ", in_.heat_scalars[2]);
+                  "heat_scalars[2], the share of plastic heating, must be 0 to 1, got ", in_.heat_scalars[2]);
   STD_TORCH_CHECK(in_.heat_boundaries.empty() || in_.heat_boundaries.size() == kBoundaries,
                   "heat_boundaries must be empty or 3 tensors, got ", in_.heat_boundaries.size());
   STD_TORCH_CHECK(in_.heat_options[0] >= 0 && in_.heat_options[0] <= int64_t(HeatTransfer::pic),
-                  "the transfer of heat must be 0 to 3, got ", in_.heat_options[0]);
+                  "heat_options[0], the transfer of heat, must be 0 to 3, got ", in_.heat_options[0]);
   STD_TORCH_CHECK(in_.heat_options[1] > 0 && in_.heat_options[1] <= INT32_MAX,
-                  "the number of iterations must be positive, got ", in_.heat_options[1]);
+                  "heat_options[1], the number of iterations, must be positive, got ", in_.heat_options[1]);
   for (const size_t k : {0, 3})
-    STD_TORCH_CHECK(in_.heat_scalars[k] > 0 && in_.heat_scalars[k] < 1, "the ", k == 0 ? "" : "adjoint ",
-                    "tolerance must be between 0 and 1, got ", in_.heat_scalars[k]);
+    STD_TORCH_CHECK(in_.heat_scalars[k] > 0 && in_.heat_scalars[k] < 1, element("heat_scalars", int(k)), ", the ",
+                    k == 0 ? "" : "adjoint ", "tolerance, must be between 0 and 1, got ", in_.heat_scalars[k]);
   STD_TORCH_CHECK(in_.wants_C, "heat needs wants_C");
   STD_TORCH_CHECK(s_.p2g.form == StressForm::mls, "heat needs the stress form mls");
   pack();

@@ -451,13 +451,16 @@ Gradients substeps_backward(const std::vector<OptionalTensor>& grads, int64_t ne
     int64_t values = 0;
     for (const Tensor& table : in.tables) values += table.size(1);
     adjoints.tables = result(x, needs & kTables, {P, values});
-    set(adjoints.x, grads[kX], "grad_x", x);
-    set(adjoints.v, grads[kV], "grad_v", x);
-    set(adjoints.C, grads[kC], "grad_C", x);
-    set(adjoints.F, grads[kF], "grad_F", x);
-    set(adjoints.J, grads[kJ], "grad_J", x);
-    set(adjoints.history, grads[kHistory], "grad_history", x);
-    set(adjoints.heat, grads[kHeat], "grad_heat", x);
+    const auto set_from = [&](Result k, Tensor& adjoint) {
+      set(adjoint, grads[k], element("grads", int(k)).c_str(), x);
+    };
+    set_from(kX, adjoints.x);
+    set_from(kV, adjoints.v);
+    set_from(kC, adjoints.C);
+    set_from(kF, adjoints.F);
+    set_from(kJ, adjoints.J);
+    set_from(kHistory, adjoints.history);
+    set_from(kHeat, adjoints.heat);
     for (Tensor* sum : {&adjoints.mass, &adjoints.volume, &adjoints.parameters, &adjoints.dt, &adjoints.heat_parameters,
                         &adjoints.tables})
       set(*sum, {}, "", x);

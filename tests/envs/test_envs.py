@@ -460,8 +460,9 @@ def test_water_at_rest_in_the_glass_is_in_it():
 def test_a_bucket_scoops():
     env = make(envs.Scoop, 1)
     env.reset(seed=0)
-    for k in range(100):
-        *_, info = env.step(torch.tensor([[0, -1, 0] if k < 25 else [1, 0, 0] if k < 60 else [0.3, 0.5, 1.0]]))
+    phases = [(10, (0.3, -0.9, -0.7)), (35, (0.9, 0.0, 0.0)), (20, (0.6, 0.2, 0.7)), (30, (0.0, 0.8, 0.3))]
+    for action in [action for count, action in phases for _ in range(count)]:
+        *_, info = env.step(torch.tensor([action]))
         if info["success"].any():
             return
     pytest.fail("too little sand was lifted")
