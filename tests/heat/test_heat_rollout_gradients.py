@@ -558,7 +558,7 @@ def test_raw_ops(law, device):
     ]
     adjoint = (grads, 511 - 16, None, *plain)
     torch.library.opcheck(torch.ops.torch_mpm.substeps_backward.default, adjoint, test_utils=checks)
-    with pytest.raises(RuntimeError, match="grads.7. must have shape"):
+    with pytest.raises(RuntimeError, match=r"grads\[7\] must have shape"):
         torch.ops.torch_mpm.substeps_backward([*grads[:7], grads[7][:, 1:]], *adjoint[1:])
 
 
