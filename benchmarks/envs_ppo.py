@@ -127,7 +127,9 @@ def plot(result: dict[str, Any], path: Path) -> None:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10, 3 * -(-len(result["tasks"]) // 3)), layout="constrained")
-    places = figure.subplots(-(-len(result["tasks"]) // 3), 3, squeeze=False).flat
+    places = list(figure.subplots(-(-len(result["tasks"]) // 3), 3, squeeze=False).flat)
+    for place in places[len(result["tasks"]) :]:
+        place.axis("off")
     for task, place in zip(result["tasks"], places, strict=False):
         place.plot(*task["curve"].values(), color="C0", label="training")
         for key, color in (("untrained", "C7"), ("trained", "C1")):

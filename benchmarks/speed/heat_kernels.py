@@ -82,8 +82,10 @@ LAW = MATRIX_PRODUCT + DETERMINANT + 1 + 5 * D * D
 """E = F Fᵀ − I and ln J, μ E + λ ln J I."""
 MOMENTUM = D + 1 + D * D + 3 + 2 * D * D
 """m v, and m dx C − dt V D⁻¹ dx⁻¹ τ."""
-MOTION = D * D + 2 * D + MATRIX_PRODUCT + 2 * D * D
-"""C from its moments, x + dt v, and F + dt C F."""
+MOTION = D * D + 2 * D
+"""C from its moments, and x + dt v."""
+DEFORMATION = MATRIX_PRODUCT + 2 * D * D + DETERMINANT + 1
+"""F + dt C F, and the present volume."""
 STRAIN_RATE = 4 * D * D + 1
 """|sym ∇v|."""
 HEAT_WEIGHTS = 9 + 3 * (1 + D) + D
@@ -127,15 +129,15 @@ class Kernel:
 
 KERNELS = (
     Kernel(
-        "law and P2G", ("ReorderingSource",), "index x mass rest_volume v C F", "nodes nodes",
-        operations=LAW + MOMENTUM + scattered(1, D),
+        "law and P2G", ("ReorderingSource",), "index x mass rest_volume v C F F volume", "nodes nodes",
+        operations=DEFORMATION + LAW + MOMENTUM + scattered(1, D),
     ),
     Kernel("grid update", ("next_grid_kernel",), "", "nodes updated nodes"),
     Kernel(
         "G2P and P2G of heat", ("HeatAdvance",),
-        "index x F rest_volume mass theta gradient volume v C x F volume conductance blend packed",
+        "index x mass theta gradient volume v C x conductance blend packed",
         "updated sums sums",
-        operations=gathered(D) + MOTION + STRAIN_RATE + DETERMINANT + 1 + HEAT_WEIGHTS + scattered(2, 2),
+        operations=gathered(D) + MOTION + STRAIN_RATE + HEAT_WEIGHTS + scattered(2, 2),
     ),
     Kernel("products with H", ("product_kernel",), " ".join(["packed"] * STEPS), PRODUCTS, "", STEPS * applied()),
     Kernel(
