@@ -22,7 +22,7 @@ NAMES = {
     "Memset (Device)": None,
     "void mpm::cuda::scatter_kernel<mpm::cuda::ReorderingSource<mpm::baseline::NeoHookean, float, 3> >": "law and P2G",
     f"void {ANONYMOUS}next_grid_kernel<false, float, 3>(mpm::NextGridArguments<float, 3>)": "grid update",
-    f"void {ANONYMOUS}advance_kernel<{ANONYMOUS}HeatAdvance<2, float, 3> >": "G2P and P2G of heat",
+    f"void {ANONYMOUS}advance_kernel<{ANONYMOUS}HeatAdvance<2, float, 3, false> >": "G2P and P2G of heat",
     EACH.format("begin_node", "HeatNodesArguments"): None,
     f"void {ANONYMOUS}pack_kernel<2, float, 3>({ANONYMOUS}SimpleKernel<2, float, 3>)": None,
     f"void {ANONYMOUS}product_kernel<2, float, 3>({ANONYMOUS}SimpleKernel<2, float, 3>)": "products with H",
@@ -82,21 +82,23 @@ def test_times_of_a_call_are_shared_by_its_substeps() -> None:
 
 
 def test_bytes_are_those_of_the_tensors() -> None:
-    """Of G2P of the motion with P2G of heat, from the tensors of the ops of one step: the fields of the particles, the
-    velocities of the nodes, and sums of 4 channels."""
+    """Of P2G with the law, which updates F, and of G2P with P2G of heat, from the tensors of the ops of one step: the
+    fields of the particles, the velocities of the nodes, and sums of 4 channels."""
     s = thermal.heated(step.setup(work.make(8), "cpu"))
     state, blocks = s.state, s.grid.activate(s.state.x)
     theta, gradient = state.temperature, state.extra["temperature_gradient"]
     conductance = blend = rest = volume = torch.empty_like(state.mass)
     packed = torch.empty(len(state), 4)
-    motion = [blocks.index, state.x, state.F, rest, state.v, state.C, state.x, state.F, volume]
-    heat = [state.mass, theta, gradient, volume, conductance, blend, packed]
     sums = torch.zeros(blocks.node_count, 4)
+    law = [blocks.index, state.x, state.mass, rest, state.v, state.C, state.F, state.F, volume, sums, sums]
+    motion = [blocks.index, state.x, state.v, state.C, state.x]
+    heat = [state.mass, theta, gradient, volume, conductance, blend, packed, sums, sums, sums]
     active = int(blocks.active_nodes().sum())
-    (kernel,) = (kernel for kernel in KERNELS if kernel.name == "G2P and P2G of heat")
     size = heat_kernels.size_of(s, state)
     assert size == Size(8**3, active, blocks.node_count)
-    assert kernel.bytes(size) == step.bytes_of([*motion, *heat, sums, sums, sums], blocks, active)
+    kernels = {kernel.name: kernel for kernel in KERNELS}
+    for name, tensors in (("law and P2G", law), ("G2P and P2G of heat", [*motion, *heat])):
+        assert kernels[name].bytes(size) == step.bytes_of(tensors, blocks, active)
     ours = {"x": state.x, "v": state.v, "C": state.C, "F": state.F, "mass": state.mass, "theta": theta}
     assert {name: t[0].numel() for name, t in ours.items()} == {name: WORDS[name] for name in ours}
 
