@@ -197,10 +197,11 @@ class Ninja:
         if nvcc() is not None:
             # The host compiler sees `#pragma unroll`, which only the device compiler knows.
             host = f"-Xcompiler={','.join([*HOST_FLAGS, '-Wno-unknown-pragmas'])}"
+            before = [str(nvcc()), f"-ccbin={cxx}", *gencode(), *COMMON_FLAGS]
+            after = [*NVCC_FLAGS, compression(), host, "-DUSE_CUDA", *torch_includes]
             for rule, level in NVCC_LEVELS.items():
-                device = [str(nvcc()), f"-ccbin={cxx}", *gencode(), *COMMON_FLAGS, level, *NVCC_FLAGS, compression()]
-                one = [*torch_includes, "$flags", "-MD", "-MF", "$out.d", "-c", "$in", "-o", "$out"]
-                self.rule(rule, [*device, host, "-DUSE_CUDA", *one], depfile=True)
+                device = [*before, level, *after, "$flags", "-MD", "-MF", "$out.d", "-c", "$in", "-o", "$out"]
+                self.rule(rule, device, depfile=True)
                 self.lines[-1] += "\n  pool = nvcc"
             # cudart is linked statically (the default), so the library does not depend on the CUDA runtime of torch.
             # Symbols that only a debugger reads, 5% of the library, are left out.

@@ -89,9 +89,7 @@ def measure_task(name: str, device: str, quick: bool) -> dict[str, Any]:
 
 def with_others(tasks: list[dict[str, Any]], earlier: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Tasks, and those of earlier results that are not among them, in the order of the example."""
-    known = {task["name"]: task for result in earlier for task in result["tasks"]} | {
-        task["name"]: task for task in tasks
-    }
+    known = {task["name"]: task for result in [*earlier, {"tasks": tasks}] for task in result["tasks"]}
     return [known[name] for name in example().TRAININGS if name in known]
 
 

@@ -7,7 +7,7 @@
 #include <utility>
 #include <vector>
 
-#include "common/backend.h"
+#include "cuda/check.h"
 
 // Kernels that are launched many times in the same order, as CUDA graphs: the host launches one graph in place of many
 // kernels, and a graph with a loop needs no host between its turns.
@@ -28,7 +28,7 @@ class CapturedGraph {
   void capture(const Work& work) {
     use_device();
     // Relaxed: concurrent work of other threads is not captured, and must not fail.
-    check(cudaStreamBeginCapture(stream_, cudaStreamCaptureModeRelaxed));
+    check_cuda(cudaStreamBeginCapture(stream_, cudaStreamCaptureModeRelaxed));
     cudaGraph_t graph = nullptr;
     try {
       work(stream_);
@@ -37,7 +37,7 @@ class CapturedGraph {
       if (graph) cudaGraphDestroy(graph);
       throw;
     }
-    check(cudaStreamEndCapture(stream_, &graph));
+    check_cuda(cudaStreamEndCapture(stream_, &graph));
     if (const auto shape = shape_of_graph(graph); shape != shape_) {
       forget();
       shape_ = shape;
@@ -48,71 +48,69 @@ class CapturedGraph {
       forget();
     }
     const cudaError_t made = executable_ ? cudaSuccess : cudaGraphInstantiate(&executable_, graph, 0);
-    check(cudaGraphDestroy(graph));
-    check(made);
+    check_cuda(cudaGraphDestroy(graph));
+    check_cuda(made);
   }
 
-  void launch(cudaStream_t stream) const { check(cudaGraphLaunch(executable_, stream)); }
+  void launch(cudaStream_t stream) const { check_cuda(cudaGraphLaunch(executable_, stream)); }
 
 #if CUDART_VERSION >= 13000
   template <class Work>
   void repeat(cudaStream_t stream, const Work& work) {
     use_device();
     cudaGraph_t graph = nullptr;
-    check(cudaGraphCreate(&graph, 0));
+    check_cuda(cudaGraphCreate(&graph, 0));
     const std::unique_ptr<std::remove_pointer_t<cudaGraph_t>, decltype(&cudaGraphDestroy)> owner(graph,
                                                                                                  &cudaGraphDestroy);
     cudaGraphNodeParams loop{};
     loop.type = cudaGraphNodeTypeConditional;
     loop.conditional.type = cudaGraphCondTypeWhile;
     loop.conditional.size = 1;
-    check(cudaGraphConditionalHandleCreate(&loop.conditional.handle, graph, 1, cudaGraphCondAssignDefault));
+    check_cuda(cudaGraphConditionalHandleCreate(&loop.conditional.handle, graph, 1, cudaGraphCondAssignDefault));
     cudaGraphNode_t node;
-    check(cudaGraphAddNode(&node, graph, nullptr, nullptr, 0, &loop));
+    check_cuda(cudaGraphAddNode(&node, graph, nullptr, nullptr, 0, &loop));
     cudaGraph_t body = loop.conditional.phGraph_out[0];
-    check(cudaStreamBeginCaptureToGraph(stream_, body, nullptr, nullptr, 0, cudaStreamCaptureModeRelaxed));
+    check_cuda(cudaStreamBeginCaptureToGraph(stream_, body, nullptr, nullptr, 0, cudaStreamCaptureModeRelaxed));
     try {
       work(stream_, loop.conditional.handle);
     } catch (...) {
       cudaStreamEndCapture(stream_, &body);
       throw;
     }
-    check(cudaStreamEndCapture(stream_, &body));
+    check_cuda(cudaStreamEndCapture(stream_, &body));
     cudaGraphExec_t executable = nullptr;
-    check(cudaGraphInstantiate(&executable, graph, 0));
+    check_cuda(cudaGraphInstantiate(&executable, graph, 0));
     const cudaError_t launched = cudaGraphLaunch(executable, stream);
     forget_later(executable);
-    check(launched);
+    check_cuda(launched);
   }
 #endif
 
  private:
-  static void check(cudaError_t error) { STD_TORCH_CHECK(error == cudaSuccess, "CUDA: ", cudaGetErrorString(error)); }
-
   void use_device() {
     int device = 0;
-    check(cudaGetDevice(&device));
+    check_cuda(cudaGetDevice(&device));
     if (stream_ && device == device_) return;
     forget();
-    if (stream_) check(cudaStreamDestroy(std::exchange(stream_, nullptr)));
-    check(cudaStreamCreateWithFlags(&stream_, cudaStreamNonBlocking));
+    if (stream_) check_cuda(cudaStreamDestroy(std::exchange(stream_, nullptr)));
+    check_cuda(cudaStreamCreateWithFlags(&stream_, cudaStreamNonBlocking));
     device_ = device;
   }
 
   // The kinds of its nodes and the clusters of its kernels, which an update cannot change.
   static std::vector<int> shape_of_graph(cudaGraph_t graph) {
     size_t count = 0;
-    check(cudaGraphGetNodes(graph, nullptr, &count));
+    check_cuda(cudaGraphGetNodes(graph, nullptr, &count));
     std::vector<cudaGraphNode_t> nodes(count);
-    check(cudaGraphGetNodes(graph, nodes.data(), &count));
+    check_cuda(cudaGraphGetNodes(graph, nodes.data(), &count));
     std::vector<int> shape;
     for (cudaGraphNode_t node : nodes) {
       cudaGraphNodeType type;
-      check(cudaGraphNodeGetType(node, &type));
+      check_cuda(cudaGraphNodeGetType(node, &type));
       shape.push_back(int(type));
       if (type != cudaGraphNodeTypeKernel) continue;
       cudaLaunchAttributeValue cluster{};
-      check(cudaGraphKernelNodeGetAttribute(node, cudaLaunchAttributeClusterDimension, &cluster));
+      check_cuda(cudaGraphKernelNodeGetAttribute(node, cudaLaunchAttributeClusterDimension, &cluster));
       shape.push_back(int(cluster.clusterDim.x));
     }
     return shape;

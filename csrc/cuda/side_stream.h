@@ -2,7 +2,7 @@
 
 #include <vector>
 
-#include "common/backend.h"
+#include "cuda/check.h"
 
 // Work beside that of a stream: a second stream of the thread, which the first one waits for.
 namespace mpm {
@@ -14,8 +14,8 @@ class SideStream {
   class Fork {
    public:
     explicit Fork(cudaStream_t stream) : stream_(stream), side_(of_this_thread()) {
-      check(cudaEventRecord(side_.event_, stream_));
-      check(cudaStreamWaitEvent(side_.stream_, side_.event_, 0));
+      check_cuda(cudaEventRecord(side_.event_, stream_));
+      check_cuda(cudaStreamWaitEvent(side_.stream_, side_.event_, 0));
     }
     Fork(const Fork&) = delete;
     Fork& operator=(const Fork&) = delete;
@@ -33,22 +33,20 @@ class SideStream {
 
  private:
   SideStream() {
-    check(cudaStreamCreateWithFlags(&stream_, cudaStreamNonBlocking));
-    check(cudaEventCreateWithFlags(&event_, cudaEventDisableTiming));
+    check_cuda(cudaStreamCreateWithFlags(&stream_, cudaStreamNonBlocking));
+    check_cuda(cudaEventCreateWithFlags(&event_, cudaEventDisableTiming));
   }
 
   static const SideStream& of_this_thread() {
     // By device; never destroyed: CUDA may be unloaded before.
     static thread_local auto* const streams = new std::vector<const SideStream*>;
     int device = 0;
-    check(cudaGetDevice(&device));
+    check_cuda(cudaGetDevice(&device));
     if (streams->size() <= size_t(device)) streams->resize(size_t(device) + 1);
     const SideStream*& own = (*streams)[size_t(device)];
     if (!own) own = new SideStream;
     return *own;
   }
-
-  static void check(cudaError_t error) { STD_TORCH_CHECK(error == cudaSuccess, "CUDA: ", cudaGetErrorString(error)); }
 
   cudaStream_t stream_ = nullptr;
   cudaEvent_t event_ = nullptr;

@@ -49,7 +49,7 @@ struct HeatAdvance {
   __device__ Written write(int p, const Loaded& l, const typename Motion::Result& sums) const {
     Written w;
     const T rate = strain_rate_of(motion.motion(sums).affine);  // of the form MLS
-    w.x = motion.write(p, p, p, l.motion, sums, [&](const Matrix<T, D>&, const Matrix<T, D>& F, const T& J) {
+    w.x = motion.write(p, p, p, l.motion, sums, [&](const Matrix<T, D>& F, const T& J) {
       volume_next.at(p) = l.rest * (motion.J_next.present() ? J : motion.F_next.present() ? determinant(F) : T(1));
     });
     w.of_nodes = heat.contribution(p, l.heat, rate, w.weights);

@@ -65,7 +65,7 @@ struct HeatAdvanceArguments {
   G2PAdvanceArguments<T, D> advance;
   HeatToNodesArguments<T, D> to_nodes;
   Field<const T> rest;
-  Field<T> volume_next;       // unless P2G or laws update F and J
+  Field<T> volume_next;       // not written where P2G or laws update F and J
   void* workspace = nullptr;  // of the solve; may be absent
 };
 

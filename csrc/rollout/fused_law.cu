@@ -38,8 +38,7 @@ struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true, false> 
   Columns<const T, moves_F ? D * D : 1> state;  // F or J, as given
   Columns<T, moves_F ? D * D : 1> kept;         // and their destination; optional
   int kept_entries;                             // of the history
-  Columns<const T, 1> rest;
-  Columns<T, 1> volume;  // present volume, optional
+  Columns<T, 1> present_volume;                 // optional
 
   // Result of the law at a particle.
   struct Changes {
@@ -58,8 +57,7 @@ struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true, false> 
         state(law.law.state, D),
         kept(Law::plastic ? law.state : late.state, D),
         kept_entries(law.history.pointer ? given_history_entries<Law>(law.law) : 0),
-        rest(a.volume),
-        volume(late.volume) {}
+        present_volume(late.volume) {}
 
   // Inputs of the law at a particle, except its history.
   __device__ void fetch(int p, Changes& changes) const {
@@ -88,12 +86,13 @@ struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true, false> 
     if (Law::viscous && Base::fields.affine.present()) a.law.C = {&C[0][0], {0, D, 1}};
     if constexpr (moves_F) {
       if (late.moves) changes.F = advance_deformation(changes.F, C, dt);
-      if (StoresVolume && volume.present()) volume.at(p) = rest.at(p) * determinant(changes.F);
+      if (StoresVolume && present_volume.present())
+        present_volume.at(p) = Base::fields.volume.at(p) * determinant(changes.F);
       a.law.state = {&changes.F[0][0], {0, D, 1}};
       if (Law::plastic) a.state = {&changes.F[0][0], {0, D, 1}};
     } else {
       if (late.moves) changes.J = advance_volume_ratio(changes.J, C, dt);
-      if (StoresVolume && volume.present()) volume.at(p) = rest.at(p) * changes.J;
+      if (StoresVolume && present_volume.present()) present_volume.at(p) = Base::fields.volume.at(p) * changes.J;
       a.law.state = {&changes.J, {0}};
     }
     if (entries > 0 && law.history.pointer) a.history = {changes.history, {0, 1}};

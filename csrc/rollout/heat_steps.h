@@ -83,7 +83,7 @@ class HeatSteps {
     HeatAdvanceArguments<T, D>& a = s_.with_heat;
     a.to_nodes = begin_nodes(x, mass, velocity_gradient, stream);
     a.rest = s_.p2g.volume;
-    a.volume_next = s_.advance.late ? Field<T>{} : column(fields.next(true), volume_);
+    a.volume_next = column(fields.next(true), volume_);
     a.workspace = packs_in_g2p() ? workspace(stream) : nullptr;
     has_volumes_ = true;
   }

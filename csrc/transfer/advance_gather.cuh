@@ -100,9 +100,9 @@ struct AdvanceGather {
   __device__ mpm::Vector<T, D> write(int p, const Loaded& l, const Result& s) const { return write(p, p, p, l, s); }
   // The motion is written to its own row, the other fields to row `to`.
   __device__ mpm::Vector<T, D> write(int p, int of_motion, int to, const Loaded& l, const Result& s) const {
-    return write(p, of_motion, to, l, s, [](const Matrix<T, D>&, const Matrix<T, D>&, const T&) {});
+    return write(p, of_motion, to, l, s, [](const Matrix<T, D>&, const T&) {});
   }
-  // Calls also(∇v, F, J) with those after the step.
+  // Calls also(F, J) with those after the step, where it moves them.
   template <class Also>
   __device__ mpm::Vector<T, D> write(int p, int of_motion, int to, const Loaded& l, const Result& s,
                                      const Also& also) const {
@@ -128,7 +128,7 @@ struct AdvanceGather {
       for (int j = 0; j < D; j++) F_next.write(to, i * D + j, deformed[i][j]);
     const T ratio = advance_volume_ratio(l.J, L, l.dt);
     J_next.write(to, 0, ratio);
-    also(L, deformed, ratio);
+    also(deformed, ratio);
     return x;
   }
   // New position. Residuals are loaded here, where no other registers are in use, as most scenes have none.
