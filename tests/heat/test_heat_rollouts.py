@@ -32,6 +32,8 @@ def compare(step, state, n=12, dt=DT, schedule=None, tolerance=1e-9):
         atol = tolerance * (float(value.abs().max()) + 1e-30)
         if name == "C":  # of one particle it is the rounding of its velocity
             atol += 64 * torch.finfo(value.dtype).eps * float(expected.v.abs().max()) / step.grid.dx
+        if name == "plastic_strain":  # with the rounding of F, whose entries are near one
+            atol += 4 * torch.finfo(value.dtype).eps
         if name == "volume_correction" and value.dtype == torch.float32:  # a strain: at the apex rounding decides
             atol += 1e-4
         torch.testing.assert_close(found[name], value, rtol=0, atol=atol, msg=lambda m, n=name: f"{n}: {m}")
