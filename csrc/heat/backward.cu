@@ -15,7 +15,7 @@ template <int Order_, class T_, int D_, int K_, int Plain, bool Affine>
 struct HeatAdjointSums {
   using T = T_;
   static constexpr int Order = Order_, D = D_, K = K_;
-  static constexpr int resident = 2;  // dual numbers need registers
+  static constexpr int resident = 5;
   using Shape = SumShape<Order, T, D, K, Plain, Affine, false, SlopeForm::none>;
   struct Loaded {
     int scene;

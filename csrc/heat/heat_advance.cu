@@ -222,7 +222,7 @@ __global__ void __launch_bounds__(K::threads, K::resident) advance_kernel(const 
   for (int64_t i = t.offsets[t.max_blocks] + int64_t(blockIdx.x) * K::threads + threadIdx.x; i < t.particles;
        i += stride)
     k.skip(t.index[i]);
-  follower.flush_counters(k.motion.displacement);
+  if (k.motion.displacement) follower.flush_counters(k.motion.displacement);
 }
 
 template <class K, class T, int D>

@@ -4,8 +4,8 @@
 #include "heat/local.h"
 #include "pointwise/heat.h"
 
-// Adjoint of a step of heat at one node, particle or slot: the formulas of the step, differentiated by dual numbers.
-// The loops of both backends go over them.
+// Adjoint of a step of heat at one node, particle or slot: the formulas of the step, differentiated by dual numbers,
+// and by formulas where an input is a matrix. The loops of both backends go over them.
 namespace mpm {
 inline namespace TORCH_MPM_ISA {
 
@@ -46,16 +46,15 @@ struct HeatGathered {
   Vector<V, D> moment[Channels];
 };
 
-// Derivatives of a sum by the first `count` of its inputs; f returns its derivative at dual inputs.
+// Derivatives of a sum by its inputs, which are few; f returns its derivative at dual inputs.
 template <int N, class V, class F>
-MPM_HD void pull_back(const V (&in)[N], V (&grad)[N], int count, const F& f) {
-  Dual<V> x[N];
-  MPM_UNROLL for (int n = 0; n < N; n++)
-    x[n] = {in[n], V(0)};
-  for (int n = 0; n < count; n++) {
-    x[n].derivative = V(1);
+MPM_HD void pull_back(const V (&in)[N], V (&grad)[N], const F& f) {
+  static_assert(N <= 6);
+  MPM_UNROLL for (int n = 0; n < N; n++) {
+    Dual<V> x[N];
+    MPM_UNROLL for (int k = 0; k < N; k++)
+      x[k] = {in[k], V(k == n ? 1 : 0)};
     grad[n] = f(x);
-    x[n].derivative = V(0);
   }
 }
 
@@ -93,36 +92,27 @@ MPM_HD BlendedAdjoint<V> pull_back_blended(const V& increment, const V& average,
                                            const V& adjoint, V& by_blend) {
   const V in[] = {increment, average, before, blend};
   V grad[4];
-  pull_back(in, grad, 4, [&](const Dual<V>(&x)[4]) { return adjoint * blended(x[0], x[1], x[2], x[3]).derivative; });
+  pull_back(in, grad, [&](const Dual<V>(&x)[4]) { return adjoint * blended(x[0], x[1], x[2], x[3]).derivative; });
   by_blend = by_blend + grad[3];
   return {grad[0], grad[1], grad[2]};
 }
 
-// Replaces the adjoint of the gradient after its transport by that before it; those of ∇v and dt are added.
+// Replaces the adjoint of the gradient after its transport by that before it; those of ∇v and dt are added. The
+// transport is g − first + second, with first = dt ∇vᵀ g and second = dt ∇vᵀ first.
 template <class At, class T, int D>
 MPM_HD void pull_back_transport(const HeatToParticlesBackwardArguments<T, D>& a, const At& at,
                                 const Vector<typename At::Value, D>& gradient, const typename At::Value& dt,
                                 Vector<typename At::Value, D>& adjoint) {
   using V = typename At::Value;
-  V in[D + D * D + 1], grad[D + D * D + 1];
-  Writer<V, D> arguments{in};
-  arguments.put(gradient);
-  arguments.put(load_matrix<D>(at, a.forward.velocity_gradient));
-  arguments.put(dt);
-  pull_back(in, grad, a.dt.pointer ? D + D * D + 1 : D + D * D, [&](const Dual<V>(&x)[D + D* D + 1]) {
-    Reader<Dual<V>, D> read{x};
-    const Vector<Dual<V>, D> before = read.vector();
-    const Matrix<Dual<V>, D> L = read.matrix();
-    const Vector<Dual<V>, D> after = transported_gradient(before, L, read.scalar());
-    V sum = adjoint[0] * after[0].derivative;
-    MPM_UNROLL for (int d = 1; d < D; d++)
-      sum = sum + adjoint[d] * after[d].derivative;
-    return sum;
-  });
-  Reader<V, D> read{grad};
-  adjoint = read.vector();
-  store_matrix<D>(Adding<At>(at), a.velocity_gradient, read.matrix());
-  if (a.dt.pointer) add_scalar(at, a.dt, read.scalar());
+  const Matrix<V, D> L = load_matrix<D>(at, a.forward.velocity_gradient);
+  const Vector<V, D> turned = transpose(L) * gradient, first = dt * turned, by_second = adjoint;
+  const Vector<V, D> by_first = dt * (L * by_second) + V(-1) * by_second;
+  Matrix<V, D> by_L;
+  MPM_UNROLL for (int i = 0; i < D; i++) MPM_UNROLL
+    for (int j = 0; j < D; j++) by_L[i][j] = dt * (gradient[i] * by_first[j] + first[i] * by_second[j]);
+  adjoint = by_second + dt * (L * by_first);
+  store_matrix<D>(Adding<At>(at), a.velocity_gradient, by_L);
+  if (a.dt.pointer) add_scalar(at, a.dt, dot(by_first, turned) + dot(by_second, transpose(L) * first));
 }
 
 // At particles inside the grid, from the increment and θ̄; the moments are times D⁻¹. Particles outside keep their
@@ -419,7 +409,7 @@ MPM_HD HeatWeights<typename At::Value> pull_back_sums(
   store_scalar(at, entry(a.value, kHeatVarying), sums.varying);
   store_scalar(at, entry(a.value, kHeatTheta), sums.theta);
   store_scalar(at, entry(a.value, kHeatMean), sums.mean);
-  pull_back(in, grad, affine ? 3 + D : 3, [&](const Dual<V>(&x)[3 + D]) {
+  pull_back(in, grad, [&](const Dual<V>(&x)[3 + D]) {
     HeatWeights<Dual<V>> w{};
     w.capacity = x[0];
     w.blend = x[1];
@@ -456,27 +446,19 @@ template <class At, class T, int D>
 MPM_HD void pull_back_volume(const HeatToNodesBackwardArguments<T, D>& a, const At& at,
                              const typename At::Value& by_volume) {
   using V = typename At::Value;
-  V in[1 + D * D], grad[1 + D * D];
-  Writer<V, D> arguments{in};
-  arguments.put(load_scalar(at, a.rest));
+  V ratio(1);  // of the present volume to that at rest
   Matrix<V, D> by_F = zero_matrix<V, D>();
+  const V by_ratio = by_volume * load_scalar(at, a.rest);
   if (a.J.pointer) {
-    arguments.put(load_scalar(at, a.J));
-    pull_back(in, grad, 2, [&](const Dual<V>(&x)[1 + D* D]) { return by_volume * (x[0] * x[1]).derivative; });
-    store_scalar(at, a.J_term, grad[1]);
+    ratio = load_scalar(at, a.J);
+    store_scalar(at, a.J_term, by_ratio);
   } else if (a.F.pointer) {
-    arguments.put(load_matrix<D>(at, a.F));
-    pull_back(in, grad, 1 + D * D, [&](const Dual<V>(&x)[1 + D* D]) {
-      Reader<Dual<V>, D> read{x + 1};
-      return by_volume * (x[0] * determinant(read.matrix())).derivative;
-    });
-    Reader<V, D> read{grad + 1};
-    by_F = read.matrix();
-  } else {
-    grad[0] = by_volume;
+    const Matrix<V, D> F = load_matrix<D>(at, a.F);
+    ratio = determinant(F);
+    by_F = by_ratio * cofactor(F);
   }
   if (a.F_term.pointer) store_matrix<D>(at, a.F_term, by_F);
-  add_scalar(at, a.volume, grad[0]);
+  add_scalar(at, a.volume, ratio * by_volume);
 }
 
 // At particles inside the grid, from the adjoints of the sums.
@@ -485,19 +467,17 @@ MPM_HD void heat_of_nodes_backward(const HeatToNodesBackwardArguments<T, D>& a, 
                                    const typename At::Value& dt,
                                    const HeatGathered<typename At::Value, D, kHeatChannels>& gathered) {
   using V = typename At::Value;
-  constexpr int scalars = 5, inputs = scalars + D * D;
   const HeatToNodesArguments<T, D>& f = a.forward;
   const V volume = load_scalar(at, f.particles.volume), dx(f.topology.geometry.dx);
-  V in[inputs], grad[inputs];
-  Writer<V, D> arguments{in};
-  arguments.put(volume);
-  arguments.put(load_value(at, f.specific_heat, scene));
-  arguments.put(load_value(at, f.conductivity, scene));
-  arguments.put(load_scalar(at, f.mass));
-  arguments.put(dt);
   const Matrix<V, D> L = load_matrix<D>(at, f.velocity_gradient);
-  arguments.put(L);
-  HeatWeights<V> weights = heat_weights(in[0], in[1], in[2], in[3], in[4], strain_rate_of(L), dx);
+  const V in[] = {volume,
+                  load_value(at, f.specific_heat, scene),
+                  load_value(at, f.conductivity, scene),
+                  load_scalar(at, f.mass),
+                  dt,
+                  strain_rate_of(L)};
+  V grad[6];
+  HeatWeights<V> weights = heat_weights(in[0], in[1], in[2], in[3], in[4], in[5], dx);
   weights.blend = blend_of(f.transfer, weights.blend);
 
   HeatWeights<V> by = pull_back_sums(a, at, weights, gathered);
@@ -507,10 +487,8 @@ MPM_HD void heat_of_nodes_backward(const HeatToNodesBackwardArguments<T, D>& a, 
   const V by_volume = a.surface_value.pointer ? pull_back_surface(a, at, scene, volume, dt) : V(0);
   if (a.rate.pointer) add_scalar(at, a.dt, weights.capacity * load_scalar(at, a.rate));
   const bool varies = f.transfer == HeatTransfer::hybrid;  // else β is constant
-  pull_back(in, grad, varies ? inputs : scalars, [&](const Dual<V>(&x)[inputs]) {
-    Reader<Dual<V>, D> read{x + scalars};
-    const HeatWeights<Dual<V>> w =
-        heat_weights(x[0], x[1], x[2], x[3], x[4], strain_rate_of(read.matrix()), Dual<V>(dx, V(0)));
+  pull_back(in, grad, [&](const Dual<V>(&x)[6]) {
+    const HeatWeights<Dual<V>> w = heat_weights(x[0], x[1], x[2], x[3], x[4], x[5], Dual<V>(dx, V(0)));
     const V sum = by.capacity * w.capacity.derivative + by.conductance * w.conductance.derivative;
     return varies ? sum + by.blend * w.blend.derivative : sum;
   });
@@ -519,8 +497,7 @@ MPM_HD void heat_of_nodes_backward(const HeatToNodesBackwardArguments<T, D>& a, 
   add_parameter(at, a.parameters, kConductivity, grad[2]);
   add_scalar(at, a.mass, grad[3]);
   add_scalar(at, a.dt, grad[4]);
-  Reader<V, D> read{grad + scalars};
-  if (varies) store_matrix<D>(Adding<At>(at), a.velocity_gradient, read.matrix());
+  if (varies) store_matrix<D>(Adding<At>(at), a.velocity_gradient, grad[5] * strain_rate_slope(L));
 }
 
 // A particle outside the grid takes no part.

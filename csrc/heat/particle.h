@@ -32,6 +32,14 @@ MPM_HD T strain_rate_of(const Matrix<T, D>& L) {
   return safe_root(squared);
 }
 
+// Derivative of that rate by ∇v, zero at rest.
+template <class T, int D>
+MPM_HD Matrix<T, D> strain_rate_slope(const Matrix<T, D>& L) {
+  const T rate = strain_rate_of(L);
+  const auto moves = rate > T(0);
+  return select(moves, T(0.5) / select(moves, rate, T(1)), T(0)) * (L + transpose(L));
+}
+
 template <class T>
 MPM_HD HeatWeights<T> heat_weights(const T& volume, const T& specific_heat, const T& conductivity, const T& mass,
                                    const T& dt, const T& strain_rate, const T& dx) {

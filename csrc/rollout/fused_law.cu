@@ -1,6 +1,7 @@
 // Fused kernels of the laws of one header, MPM_LAW_HEADER: the law is evaluated as P2G loads a particle.
 #define MPM_REGISTER_LAW(Law) static const bool Law##_is_fused = cuda::enter_fused<Law>();
 
+#include "laws/fluid.h"
 #include "rollout/fused_law.h"
 #include "rollout/schedules/block_per_scene.cuh"
 #include "rollout/schedules/fused_g2p2g.cuh"
@@ -74,9 +75,20 @@ struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true, false> 
     for (int k = 0; k < kParameters<Law>; k++) r.value[k] = load_parameter(One<T>{p}, law.law, k);
     return r;
   }
-  // Stress from the loaded inputs, which become the values to be stored.
-  __device__ Matrix<T, D> stress(int p, const Matrix<T, D>& C, const T& dt, const Parameters& parameters,
-                                 Changes& changes) const {
+  // The update that the previous G2P has deferred.
+  __device__ void move(int p, const Matrix<T, D>& C, const T& dt, Changes& changes) const {
+    if constexpr (moves_F) {
+      if (late.moves) changes.F = advance_deformation(changes.F, C, dt);
+      if (StoresVolume && present_volume.present())
+        present_volume.at(p) = Base::fields.volume.at(p) * determinant(changes.F);
+    } else {
+      if (late.moves) changes.J = advance_volume_ratio(changes.J, C, dt);
+      if (StoresVolume && present_volume.present()) present_volume.at(p) = Base::fields.volume.at(p) * changes.J;
+    }
+  }
+  // Stress from the inputs, which become the values to be stored.
+  __device__ Matrix<T, D> stress_of_law(int p, const Matrix<T, D>& C, const Parameters& parameters,
+                                        Changes& changes) const {
     const One<T> at{p};
     Matrix<T, D> stress;
     LawUpdateArguments<T, D> a = law;
@@ -85,14 +97,9 @@ struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true, false> 
     for (int k = 0; k < kParameters<Law>; k++) a.law.parameters[k] = {&parameters.value[k]};
     if (Law::viscous && Base::fields.affine.present()) a.law.C = {&C[0][0], {0, D, 1}};
     if constexpr (moves_F) {
-      if (late.moves) changes.F = advance_deformation(changes.F, C, dt);
-      if (StoresVolume && present_volume.present())
-        present_volume.at(p) = Base::fields.volume.at(p) * determinant(changes.F);
       a.law.state = {&changes.F[0][0], {0, D, 1}};
       if (Law::plastic) a.state = {&changes.F[0][0], {0, D, 1}};
     } else {
-      if (late.moves) changes.J = advance_volume_ratio(changes.J, C, dt);
-      if (StoresVolume && present_volume.present()) present_volume.at(p) = Base::fields.volume.at(p) * changes.J;
       a.law.state = {&changes.J, {0}};
     }
     if (entries > 0 && law.history.pointer) a.history = {changes.history, {0, 1}};
@@ -100,9 +107,11 @@ struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true, false> 
     if (law.stress.pointer) store_matrix<D>(at, law.stress, stress);
     return stress;
   }
-  __device__ Matrix<T, D> evaluate(int p, const Matrix<T, D>& C, const T& dt, Changes& changes) const {
-    fetch(p, changes);
-    return stress(p, C, dt, parameters(p), changes);
+  // Both, from the loaded inputs.
+  __device__ Matrix<T, D> stress(int p, const Matrix<T, D>& C, const T& dt, const Parameters& parameters,
+                                 Changes& changes) const {
+    move(p, C, dt, changes);
+    return stress_of_law(p, C, parameters, changes);
   }
   __device__ void keep(int p, const Changes& changes) const {
     if (kept.present()) {
@@ -117,9 +126,10 @@ struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true, false> 
   __device__ Matrix<T, D> update(int p, const Matrix<T, D>& C, const T& dt) const {
     if constexpr (MayMove) {
       Changes changes;
-      const Matrix<T, D> stress = evaluate(p, C, dt, changes);
+      fetch(p, changes);
+      const Matrix<T, D> result = stress(p, C, dt, parameters(p), changes);
       keep(p, changes);
-      return stress;
+      return result;
     } else {
       Matrix<T, D> stress;
       LawUpdateArguments<T, D> a = law;
@@ -158,16 +168,60 @@ struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true, false> 
   }
 };
 
-// The same for particles that P2G also moves into the order of its items, if the call owns them.
+// Whether P2G evaluates the law where it reads the temperature.
+template <class Law>
+constexpr bool kReadsTemperature = kChangesNothing<Law>;
+
+// What a material is besides its law, where that reads the temperature (rollout/thermal_laws.h).
+template <class T, int D>
+struct MaterialAtTemperature {
+  const ThermalP2GArguments<T, D>& a;
+  One<T> at;
+  T J = T(1);  // that the liquid reads
+
+  __device__ T parameter(const TemperatureTable<T>& table, const T& otherwise) const {
+    return table.knots > 0 ? value_at(table, load_scalar(at, a.theta)) : otherwise;
+  }
+  // F that the law reads. J of the material is updated as F was, if `moves`, by a step of C.
+  __device__ Matrix<T, D> deformation(const Matrix<T, D>& F, bool moves, const Matrix<T, D>& C,
+                                      const ParticleMomentum<T, D>& m) {
+    if (a.melts()) J = load_scalar(at, a.J);
+    if (a.melts() && moves) J = advance_volume_ratio(J, C, m.dt);
+    if (a.present_volume.pointer) store_scalar(at, a.present_volume, m.volume * J);
+    const Phases<T, D> read = read_by_laws(a, at, Phases<T, D>{J, F});
+    J = read.J;
+    return read.F;
+  }
+  __device__ T volume_ratio(const T& ratio) const { return read_by_laws<T, D>(a, at, {ratio, zero_matrix<T, D>()}).J; }
+  __device__ void store_J() const { store_scalar(at, a.J_next, volume_of_stretch<D>(stretch_of(a, at)) * J); }
+  __device__ Matrix<T, D> stress(const Matrix<T, D>& solid, const Matrix<T, D>& C) const {
+    InvariantState<ViscousFluid, T, D> liquid;
+    liquid.J = J;
+    liquid.C = a.is_viscous ? C : zero_matrix<T, D>();
+#pragma unroll
+    for (int k = 0; k < kParameters<ViscousFluid>; k++) {
+      const bool is_given = k < kParameters<WeaklyCompressible> || a.is_viscous;
+      liquid.parameters[k] = is_given ? parameter(a.liquid[k], load_parameter(at, a.fluid, k)) : T(0);
+    }
+    return stress_of_phases(a, at, solid, stress_of(liquid));
+  }
+};
+
+// Particles that P2G also moves into the order of its items, if the call owns them, and whose law may read the
+// temperature.
 template <class Law, class T, int D>
 struct ReorderingSource : LawMomentumSource<Law, T, D, true, true> {
   using Base = LawMomentumSource<Law, T, D, true, true>;
+  using Changes = typename Base::Changes;
+  using Parameters = typename Base::Parameters;
+  ThermalP2GArguments<T, D> thermal;
   ReorderOnScatter<T, D> reorder;
   WorkOfLaunch work;
 
-  ReorderingSource(const P2GArguments<T, D>& a, const LawUpdateArguments<T, D>& law, const LateDeformation<T, D>& late,
+  ReorderingSource(const P2GArguments<T, D>& a, const LawUpdateArguments<T, D>& law,
+                   const ThermalP2GArguments<T, D>& thermal, const LateDeformation<T, D>& late,
                    const ReorderOnScatter<T, D>& reorder)
-      : Base(a, law, late), reorder(reorder), work(a.work) {}
+      : Base(a, law, late), thermal(thermal), reorder(reorder), work(a.work) {}
 
   bool is_mostly_idle() const {
     return reorder.rows > 0 ? reorder.is_mostly_idle() : work.displacement && !work.where_it_lasts;
@@ -191,11 +245,46 @@ struct ReorderingSource : LawMomentumSource<Law, T, D, true, true> {
  private:
   __device__ void take(int p, int place, const ParticleMomentum<T, D>& m, const Matrix<T, D>& C,
                        Matrix<T, D>& stress) const {
-    typename Base::Changes changes;
-    stress = Base::evaluate(p, C, m.dt, changes);
+    Changes changes;
+    Base::fetch(p, changes);
+    Parameters parameters = Base::parameters(p);
+    Base::move(p, C, m.dt, changes);
+    MaterialAtTemperature<T, D> material{thermal, {p}};
+    if (reads_temperature()) {
+      Base::keep(p, changes);
+      read_temperature(m, C, material, parameters, changes);
+    }
+    stress = Base::stress_of_law(p, C, parameters, changes);
+    if (reads_temperature()) return melt(C, material, changes, stress);
     const int to = reorder.rows ? reorder.in_other_copy(p, place) : p;
     Base::keep(to, changes);
     if (reorder.rows) write_reordered(p, place, to, m);
+  }
+  __device__ bool reads_temperature() const { return kReadsTemperature<Law> && thermal.given; }
+  __device__ void read_temperature(const ParticleMomentum<T, D>& m, const Matrix<T, D>& C,
+                                   MaterialAtTemperature<T, D>& material, Parameters& parameters,
+                                   Changes& changes) const {
+#pragma unroll
+    for (int k = 0; k < kParameters<Law>; k++)
+      parameters.value[k] = material.parameter(thermal.solid[k], parameters.value[k]);
+    if constexpr (Base::moves_F)
+      changes.F = material.deformation(changes.F, Base::late.moves, C, m);
+    else
+      changes.J = material.volume_ratio(changes.J);
+  }
+  // F and J of a material that melts, and its stress from that of the solid.
+  __device__ void melt(const Matrix<T, D>& C, const MaterialAtTemperature<T, D>& material, Changes& changes,
+                       Matrix<T, D>& stress) const {
+    if constexpr (Base::moves_F) {
+      if (!thermal.melts()) return;
+      material.store_J();
+      if (is_solid(thermal, material.at)) return;
+      if (has_collapsed(thermal, material.at)) {
+        changes.F = stretch_of(thermal, material.at) * changes.F;
+        Base::keep(int(material.at.p), changes);
+      }
+      stress = material.stress(stress, C);
+    }
   }
   __device__ void write_reordered(int p, int place, int to, const ParticleMomentum<T, D>& m) const {
     const One<T> at{to};
@@ -213,9 +302,10 @@ struct ReorderingSource : LawMomentumSource<Law, T, D, true, true> {
 // In float only: in double the kernels would need all registers.
 template <class Law, int D>
 struct FusedLaunches {
-  static void p2g(const LawUpdateArguments<float, D>& law, const LateDeformation<float, D>& late,
-                  const P2GArguments<float, D>& a, const ReorderOnScatter<float, D>& reorder, void* stream) {
-    launch_scatter(ReorderingSource<Law, float, D>(a, law, late, reorder), static_cast<Stream>(stream));
+  static void p2g(const LawUpdateArguments<float, D>& law, const ThermalP2GArguments<float, D>& thermal,
+                  const LateDeformation<float, D>& late, const P2GArguments<float, D>& a,
+                  const ReorderOnScatter<float, D>& reorder, void* stream) {
+    launch_scatter(ReorderingSource<Law, float, D>(a, law, thermal, late, reorder), static_cast<Stream>(stream));
   }
   static void g2p2g(const LawUpdateArguments<float, D>& law, const G2P2GArguments<float, D>& a, void* stream) {
     launch_g2p2g(LawMomentumSource<Law, float, D, true>(a.p2g, law, a.late),
@@ -239,6 +329,7 @@ template <class Law, int D>
 void fill_fused(FusedLawKernels<float, D>& kernels) {
   using Launches = FusedLaunches<Law, D>;
   kernels.p2g = Launches::p2g;
+  kernels.reads_temperature = kReadsTemperature<Law>;
   kernels.g2p2g = Launches::g2p2g;
 #if CUDART_VERSION >= 13000
   kernels.persistent = Launches::persistent;

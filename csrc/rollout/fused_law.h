@@ -7,6 +7,7 @@
 #include "rollout/schedules/block_per_scene.h"
 #include "rollout/schedules/fused_g2p2g.h"
 #include "rollout/schedules/persistent.h"
+#include "rollout/thermal_laws.h"
 
 // Kernels that evaluate a law within a transfer, on CUDA, for quadratic weights and the MLS form. Each object file of
 // rollout/fused_law.cu registers those of its laws when the library is loaded.
@@ -16,8 +17,9 @@ namespace mpm {
 template <class T, int D>
 struct FusedLawKernels {
   // Update of F or J, law and P2G in one, the stress in registers.
-  void (*p2g)(const LawUpdateArguments<T, D>&, const LateDeformation<T, D>&, const P2GArguments<T, D>&,
-              const ReorderOnScatter<T, D>&, void* stream) = nullptr;
+  void (*p2g)(const LawUpdateArguments<T, D>&, const ThermalP2GArguments<T, D>&, const LateDeformation<T, D>&,
+              const P2GArguments<T, D>&, const ReorderOnScatter<T, D>&, void* stream) = nullptr;
+  bool reads_temperature = false;  // whether that P2G evaluates laws of temperature
   // G2P and the next P2G in one.
   void (*g2p2g)(const LawUpdateArguments<T, D>&, const G2P2GArguments<T, D>&, void* stream) = nullptr;
   // Substeps of few particles, with CUDA 13.

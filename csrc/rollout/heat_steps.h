@@ -75,11 +75,12 @@ class HeatSteps {
     has_volumes_ = true;
   }
 
-  // Lets G2P of the substep compute P2G of heat, and the volumes for the next substep unless P2G or laws do; on CUDA in
-  // a call whose activations last. Sums on deterministic grids have an order.
+  // Lets G2P of the substep compute P2G of heat, and the volumes for the next substep unless P2G or laws do; on CUDA.
+  // Sums on deterministic grids have an order, and FLIP a G2P of its own.
   void join_g2p(const Field<const T>& x, const Field<const T>& mass, const Field<const T>& velocity_gradient,
                 backend::Stream stream) {
-    if (!kAdvancesHeat<T, D> || !s_.displacements.defined() || in_.lattice.deterministic()) return;
+    const bool is_cpu = MPM_BACKEND == MPM_BACKEND_IS_cpu;
+    if (!kAdvancesHeat<T, D> || is_cpu || s_.flips() || in_.lattice.deterministic()) return;
     HeatAdvanceArguments<T, D>& a = s_.with_heat;
     a.to_nodes = begin_nodes(x, mass, velocity_gradient, stream);
     a.rest = s_.p2g.volume;

@@ -189,7 +189,7 @@ class Recorded {
   }
 
   void begin_heat(int64_t i) {
-    heat->begin(state(i).F, state(i).J, steps.p2g.volume, stream_);
+    if (heat->begins()) heat->begin(state(i).F, state(i).J, steps.p2g.volume, stream_);
     if (heat->heats_by_laws()) steps.dissipate(heat->dissipated());
   }
 
@@ -266,7 +266,7 @@ Recorded<T, D>::Recorded(const SubstepsInputs& in, const OptionalTensor& memory,
     heat.emplace(steps);
     first_heat_ = copy_of(heat->state());
   }
-  if (ThermalLaws<T, D>::wanted(steps)) thermal.emplace(steps, heat ? &*heat : nullptr);
+  if (ThermalLaws<T, D>::wanted(steps)) thermal.emplace(steps, heat ? &*heat : nullptr), thermal->separate();
   steps.laws_are_apart = thermal || (heat && heat->heats_by_laws());
   steps.forget_stress();  // each step has its own stress
   steps.fuse(true);
@@ -358,11 +358,13 @@ bool Recorded<T, D>::run() {
     if (heat) begin_heat(i);
     if (thermal) use_thermal_laws(i);
     thermal ? thermal->run(stream_) : steps.run_laws(stream_);
+    if (heat) heat->join_g2p(state(i).x, steps.p2g.mass, constant(C[i]), stream_);
     steps.move(stream_);
     if (heat) conduct_heat(i);
     steps.end_time(stream_);
     after_substeps(in_.x.size(0), 1, stream_);
   }
+  steps.with_heat = {};  // the backward pass has no G2P
   return taken_ = true;
 }
 

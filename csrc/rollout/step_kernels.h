@@ -55,13 +55,14 @@ struct Substeps {
   std::optional<BodiesCall<T, D>> bodies;               // free bodies, which move after the obstacles act
   Tensor impulse = absent(), impulse_slots = absent();  // on obstacles and walls, if wanted; see `add_impulses_to`
   bool obstacles = false, fused = false;
-  bool laws_are_apart = false;  // whether laws have kernels of their own: they read temperatures, or heat the particles
-  Tensor kept = absent();       // of FLIP, see `keep_velocities`
-  Tensor tiles = absent();      // of sums with an order, see csrc/transfer/tiles.h
-  LateDeformation<T, D> late;   // of P2G, if G2P defers F or J to it
-  ReorderOnScatter<T, D> reorder;  // of P2G, if the call owns the particles
-  bool nodes_are_clear = false;    // when a step begins
-  int used_slots = 0;              // on the CPU: number of slots with a block, if the activation counts them
+  bool laws_are_apart = false;        // whether laws have kernels of their own, which other kernels precede or follow
+  ThermalP2GArguments<T, D> thermal;  // of P2G, if it evaluates laws of temperature
+  Tensor kept = absent();             // of FLIP, see `keep_velocities`
+  Tensor tiles = absent();            // of sums with an order, see csrc/transfer/tiles.h
+  LateDeformation<T, D> late;         // of P2G, if G2P defers F or J to it
+  ReorderOnScatter<T, D> reorder;     // of P2G, if the call owns the particles
+  bool nodes_are_clear = false;       // when a step begins
+  int used_slots = 0;                 // on the CPU: number of slots with a block, if the activation counts them
   const int* previous_status = nullptr;
   PlanFacts facts;
 
@@ -222,7 +223,9 @@ struct Substeps {
 
   // Lets P2G compute the stress, if there is a kernel for it.
   void fuse(bool keeps_stress) {
-    fused = why_not_fused_law(facts).empty() && !p2g.deterministic && fused_kernels.p2g && !laws_are_apart;
+    PlanFacts f = facts;
+    if (thermal.given) f.laws = 1;  // P2G evaluates the law of a liquid with that of its solid
+    fused = why_not_fused_law(f).empty() && !p2g.deterministic && fused_kernels.p2g && !laws_are_apart;
     if (fused && !keeps_stress) forget_stress();
   }
 
@@ -315,7 +318,7 @@ struct Substeps {
   void move_grid(backend::Stream stream) {
     clear_nodes(stream);
     if (fused)
-      fused_kernels.p2g(laws[0], late, p2g, reorder, stream);
+      fused_kernels.p2g(laws[0], thermal, late, p2g, reorder, stream);
     else
       backend::p2g(in.lattice.order(), p2g, stream);
     move_nodes(stream);

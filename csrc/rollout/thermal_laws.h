@@ -6,7 +6,8 @@
 
 // Laws of temperature in many substeps, at one particle: before the laws of a material their parameters, F and J
 // without expansion, and those of both phases; after them the stress, F and J of the material
-// (torch_mpm/laws/thermal.py). Copies of chunks on the CPU and kernels on CUDA loop over the particles.
+// (torch_mpm/laws/thermal.py). Copies of chunks on the CPU and kernels on CUDA loop over the particles; on CUDA P2G may
+// evaluate them as it loads the particles.
 namespace mpm {
 
 // Piecewise linear function of temperature, constant beyond its ends; of one knot: a number. None: absent.
@@ -33,15 +34,22 @@ struct DeferredMotion {
   Field<T> volume;                 // present volume after the update; absent where there was none
 };
 
+// What a material reads of the temperature beside the parameters of its laws.
+template <class T>
+struct ThermalMaterial {
+  Field<const T> theta, fraction;            // [P]; the liquid fraction where it melts
+  TemperatureTable<T> expansion, coherency;  // the coherency, of one knot, where it melts
+
+  MPM_HD bool melts() const { return coherency.knots > 0; }
+};
+
 // A material, whose only law is that of the solid where it does not melt.
 template <class T, int D>
-struct ThermalLawsArguments {
+struct ThermalLawsArguments : ThermalMaterial<T> {
   int64_t particles = 0;
   Members members;
-  Field<const T> theta, fraction;  // [P]; the liquid fraction where it melts
   int parameter_count = 0;
   TableParameter<T> parameters[2 * kMostParameters];  // of both laws
-  TemperatureTable<T> expansion, coherency;           // the coherency, of one knot, where it melts
   // F and J of the material, and those that laws read; those are absent where laws read those of the material.
   Field<const T> F, J;
   Field<T> elastic_F, elastic_J;
@@ -56,6 +64,19 @@ struct ThermalLawsArguments {
   MPM_HD bool has_elastic() const { return elastic_F.pointer || elastic_J.pointer; }
   MPM_HD bool begins() const { return parameter_count > 0 || has_elastic(); }
   MPM_HD bool ends() const { return next_F.pointer || next_J.pointer || liquid_stress.pointer; }
+};
+
+// Laws of temperature that P2G evaluates: of a material of all particles, whose law changes nothing and whose liquid is
+// a viscous fluid, or a weakly compressible one.
+template <class T, int D>
+struct ThermalP2GArguments : ThermalMaterial<T> {
+  bool given = false;
+  TemperatureTable<T> solid[kMostParameters], liquid[kMostParameters];  // their parameters by tables
+  // Where it melts.
+  LawArguments<T, D> fluid;
+  bool is_viscous = false;
+  Field<const T> J;                 // of the material, before the update that G2P has deferred
+  Field<T> J_next, present_volume;  // after the laws; after that update, absent where there was none
 };
 
 inline namespace TORCH_MPM_ISA {
@@ -84,17 +105,44 @@ MPM_HD S value_at(const TemperatureTable<T>& table, const S& theta) {
   return lift<S>(value[0]) + at.share * lift<S>(value[1] - value[0]);
 }
 
-template <class T, int D>
-MPM_HD T stretch_of(const ThermalLawsArguments<T, D>& a, const One<T>& at) {
+template <class T>
+MPM_HD T stretch_of(const ThermalMaterial<T>& a, const One<T>& at) {
   if (a.expansion.knots == 0) return T(1);
   const T theta = load_scalar(at, a.theta);
   return thermal_stretch(value_at(a.expansion, theta), theta);
 }
 
 // Whether the solid of a particle has lost its coherency.
+template <class T>
+MPM_HD bool has_collapsed(const ThermalMaterial<T>& a, const One<T>& at) {
+  return a.melts() && load_scalar(at, a.fraction) >= a.coherency.value[0];
+}
+
+// F and J that laws read, those of both phases where the material melts, from those of the material.
 template <class T, int D>
-MPM_HD bool has_collapsed(const ThermalLawsArguments<T, D>& a, const One<T>& at) {
-  return a.coherency.knots > 0 && load_scalar(at, a.fraction) >= a.coherency.value[0];
+MPM_HD Phases<T, D> read_by_laws(const ThermalMaterial<T>& a, const One<T>& at, const Phases<T, D>& of_material) {
+  const T factor = T(1) / stretch_of(a, at);
+  const Phases<T, D> elastic{volume_of_stretch<D>(factor) * of_material.J, factor * of_material.F};
+  if (!a.melts()) return elastic;
+  return phases_of(elastic.J, elastic.F, load_scalar(at, a.fraction), a.coherency.value[0]);
+}
+
+// Stress of a material that melts.
+template <class T, int D>
+MPM_HD Matrix<T, D> stress_of_phases(const ThermalMaterial<T>& a, const One<T>& at, const Matrix<T, D>& solid,
+                                     const Matrix<T, D>& liquid) {
+  const T fraction = load_scalar(at, a.fraction);
+  Matrix<T, D> stress;
+  MPM_UNROLL for (int i = 0; i < D; i++) MPM_UNROLL
+    for (int j = 0; j < D; j++)
+      stress[i][j] = stress_of_phases(solid[i][j], liquid[i][j], fraction, a.coherency.value[0]);
+  return stress;
+}
+
+// Whether a particle has no liquid, so that its stress is that of the solid.
+template <class T>
+MPM_HD bool is_solid(const ThermalMaterial<T>& a, const One<T>& at) {
+  return !a.melts() || (load_scalar(at, a.fraction) == T(0) && !has_collapsed(a, at));
 }
 
 // Whether F of the material is that of its laws. F of a solid changes by plastic flow, and where it melts.
@@ -137,11 +185,7 @@ MPM_HD void begin_laws_of(const ThermalLawsArguments<T, D>& a, int64_t p) {
   for (int k = 0; k < a.parameter_count; k++)
     a.parameters[k].to[p] = value_at(a.parameters[k].table, load_scalar(at, a.theta));
   if (!a.has_elastic()) return;
-  const T factor = T(1) / stretch_of(a, at);
-  Phases<T, D> phases = load_moved(a, at);
-  phases.F = factor * phases.F;
-  phases.J = volume_of_stretch<D>(factor) * phases.J;
-  if (a.coherency.knots > 0) phases = phases_of(phases.J, phases.F, load_scalar(at, a.fraction), a.coherency.value[0]);
+  const Phases<T, D> phases = read_by_laws(a, at, load_moved(a, at));
   if (a.elastic_F.pointer) store_matrix<D>(at, a.elastic_F, phases.F);
   if (a.elastic_J.pointer) store_scalar(at, a.elastic_J, phases.J);
 }
@@ -151,22 +195,17 @@ template <class T, int D>
 MPM_HD void end_laws_of(const ThermalLawsArguments<T, D>& a, int64_t p) {
   if (!a.members.has(p)) return;
   const One<T> at{p};
-  const T factor = stretch_of(a, at), fraction = a.coherency.knots > 0 ? load_scalar(at, a.fraction) : T(0);
-  const bool flows = has_collapsed(a, at);
+  const T factor = stretch_of(a, at);
   if (changes_F(a, at)) store_matrix<D>(at, a.next_F, factor * load_matrix<D>(at, constant(a.elastic_F)));
   if (a.next_J.pointer)
     store_scalar(at, a.next_J, volume_of_stretch<D>(factor) * load_scalar(at, constant(a.elastic_J)));
-  const bool is_solid = fraction == T(0) && !flows;
-  if (is_solid && !a.difference.pointer) return;
+  const bool solid_alone = is_solid(a, at);
+  if (solid_alone && !a.difference.pointer) return;
   const Matrix<T, D> solid = load_matrix<D>(at, constant(a.stress)), liquid = load_matrix<D>(at, a.liquid_stress);
   if (a.difference.pointer) store_matrix<D>(at, a.difference, liquid - solid);
-  if (is_solid) return;
-  Matrix<T, D> stress;
-  MPM_UNROLL for (int i = 0; i < D; i++) MPM_UNROLL
-    for (int j = 0; j < D; j++)
-      stress[i][j] = stress_of_phases(solid[i][j], liquid[i][j], fraction, a.coherency.value[0]);
-  store_matrix<D>(at, a.stress, stress);
-  if (a.dissipated.pointer && flows) store_scalar(at, a.dissipated, T(0));
+  if (solid_alone) return;
+  store_matrix<D>(at, a.stress, stress_of_phases(a, at, solid, liquid));
+  if (a.dissipated.pointer && has_collapsed(a, at)) store_scalar(at, a.dissipated, T(0));
 }
 
 }  // namespace TORCH_MPM_ISA

@@ -1,10 +1,13 @@
 #pragma once
 
+#include <algorithm>
+
+#include "laws/fluid.h"
 #include "rollout/heat_steps.h"
 #include "rollout/thermal_laws.h"
 
 // Laws of temperature in a call of many substeps: their tables, and where laws are computed kernel by kernel their
-// buffers and kernels.
+// buffers and kernels, or their arguments of P2G.
 namespace mpm {
 
 // What a table gives in the place of the number of a parameter: the expansion of a material, the coherency of a liquid.
@@ -54,37 +57,70 @@ std::vector<LawTemperature<T>> temperatures_of_laws(const SubstepsInputs& in, co
   return laws;
 }
 
-// The laws of a call kernel by kernel, with buffers for what they read in place of the fields of the particles.
+// The laws of a call: kernel by kernel, with buffers for what they read in place of the fields of the particles, or in
+// P2G.
 template <class T, int D>
 class ThermalLaws {
  public:
   static bool wanted(const Substeps<T, D>& s) { return !s.in.thermal.empty() || s.melts; }
 
   // `heat` must be there.
-  ThermalLaws(Substeps<T, D>& steps, const HeatSteps<T, D>* heat) : s_(steps), heat_(heat) {
-    const int64_t P = s_.in.x.size(0);
-    const std::vector<LawTemperature<T>> laws = temperatures_of_laws<T>(s_.in, s_.calls);
-    materials_.resize(laws.size());
-    columns_.resize(laws.size());
-    liquid_stress_.resize(laws.size());
+  ThermalLaws(Substeps<T, D>& steps, const HeatSteps<T, D>* heat)
+      : s_(steps), heat_(heat), laws_(temperatures_of_laws<T>(s_.in, s_.calls)) {
+    materials_.resize(laws_.size());
+    columns_.resize(laws_.size());
+    liquid_stress_.resize(laws_.size());
     int first = 0;
-    for (size_t k = 0; k < laws.size(); k++) {
+    for (size_t k = 0; k < laws_.size(); k++) {
+      for (int i = 0; i < kMostParameters; i++)
+        if (laws_[k].parameters[i].knots > 0) columns_[first_of(k)].push_back(first + i);
+      first += int(s_.calls[k].parameters.size());
+    }
+  }
+
+  // Gives laws kernels of their own.
+  void separate() {
+    for (size_t k = 0; k < laws_.size(); k++) {
       const bool melts = s_.calls[k].melts;
       ThermalLawsArguments<T, D>& a = materials_[first_of(k)];
-      a.particles = P;
+      a.particles = s_.in.x.size(0);
       a.members = s_.laws[k].law.members;
       for (int i = 0; i < kMostParameters; i++)
-        if (laws[k].parameters[i].knots > 0) {
-          columns_[first_of(k)].push_back(first + i);
-          add_parameter(a, s_.laws[k].law.parameters[i], laws[k].parameters[i]);
-        }
-      first += int(s_.calls[k].parameters.size());
-      if (!melts) a.expansion = laws[k].expansion;
-      if (melts) a.coherency = laws[k].coherency;
+        if (laws_[k].parameters[i].knots > 0) add_parameter(a, s_.laws[k].law.parameters[i], laws_[k].parameters[i]);
+      if (!melts) a.expansion = laws_[k].expansion;
+      if (melts) a.coherency = laws_[k].coherency;
     }
-    for (size_t k = 0; k < laws.size(); k++) make_buffers(k);
+    for (size_t k = 0; k < laws_.size(); k++) make_buffers(k);
     // The law of a liquid reads and writes nothing of that of its solid, before which its inputs are computed.
-    for (size_t k = 0; k < laws.size(); k++) s_.laws[k].runs_beside = s_.calls[k].melts;
+    for (size_t k = 0; k < laws_.size(); k++) s_.laws[k].runs_beside = s_.calls[k].melts;
+    s_.laws_are_apart = true;
+  }
+
+  // Whether P2G can evaluate the laws: those of a material of all particles, where a liquid is a fluid.
+  bool fit_p2g() const {
+    const std::string liquid = has_liquid(0) ? s_.calls[1].law->info.name : "";
+    const bool is_fluid = liquid == WeaklyCompressible::name || liquid == ViscousFluid::name;
+    return is_alone() && (liquid.empty() || is_fluid) && s_.fused_kernels.reads_temperature;
+  }
+
+  // Lets P2G evaluate them, of the fields of the last Substeps::read(), and write J of `to`. Present volumes are stored
+  // where a G2P has deferred their update (`has_left`).
+  void enter_p2g(const Field<T>& J, bool has_left, const Field<T>& present_volume) {
+    ThermalP2GArguments<T, D>& a = s_.thermal;
+    a.given = true;
+    a.theta = heat_->temperature();
+    a.expansion = laws_[0].expansion;
+    std::copy_n(laws_[0].parameters, kMostParameters, a.solid);
+    if (has_left && !has_liquid(0)) s_.late.volume = present_volume;
+    if (!has_liquid(0)) return;
+    a.fraction = heat_->liquid_fraction();
+    a.coherency = laws_[1].coherency;
+    std::copy_n(laws_[1].parameters, kMostParameters, a.liquid);
+    a.fluid = s_.laws[1].law;
+    a.is_viscous = s_.calls[1].law->info.viscous;
+    a.J = a.fluid.state;
+    a.J_next = J;
+    a.present_volume = has_left ? present_volume : Field<T>{};
   }
 
   // Replaces the settings of Substeps::read and Substeps::write for these laws. F and J after the laws are written to
@@ -117,8 +153,7 @@ class ThermalLaws {
   // and J without expansion, or those of both phases.
   bool may_move() const {
     const ThermalLawsArguments<T, D>& a = materials_[0];
-    const bool alone = count() == size_t(has_liquid(0) ? 2 : 1) && !has(s_.in.material);
-    return alone && bool(a.elastic_F.pointer) == has(s_.in.F) && bool(a.elastic_J.pointer) == has(s_.in.J);
+    return is_alone() && bool(a.elastic_F.pointer) == has(s_.in.F) && bool(a.elastic_J.pointer) == has(s_.in.J);
   }
 
   // Lets the laws update F and J of the particles `to`, if a G2P has deferred that (`has_left`), and store the present
@@ -170,6 +205,8 @@ class ThermalLaws {
   size_t first_of(size_t k) const { return s_.calls[k].melts ? k - 1 : k; }
 
  private:
+  bool is_alone() const { return count() == size_t(has_liquid(0) ? 2 : 1) && !has(s_.in.material); }
+
   void add_parameter(ThermalLawsArguments<T, D>& a, Parameter<T>& p, const TemperatureTable<T>& table) {
     buffers_.push_back(empty(s_.in.x, {a.particles}));
     T* const to = static_cast<T*>(buffers_.back().data_ptr());
@@ -202,6 +239,7 @@ class ThermalLaws {
 
   Substeps<T, D>& s_;
   const HeatSteps<T, D>* const heat_;
+  const std::vector<LawTemperature<T>> laws_;
   std::vector<ThermalLawsArguments<T, D>> materials_;  // with their first law
   std::vector<std::vector<int>> columns_;              // of their parameters by tables in those of all laws
   std::vector<Field<T>> liquid_stress_;

@@ -749,7 +749,7 @@ __device__ void scatter_item(const Source& source, const Topology<typename Sourc
   const int slot = threadIdx.x < 1 << D ? schedule_of(t).neighbours[(item.slot << D) + threadIdx.x] : -1;
   for (int begin = item.begin; begin < item.end; begin += S::batch) {
     load_particles<S>(source, t, item.block, m.base_block, shared, m.out_of_block, begin,
-                      min(S::batch, item.end - begin), in_order || is_fixed(source.nodes));
+                      ::min(S::batch, item.end - begin), in_order || is_fixed(source.nodes));
     if (threadIdx.x < 1 << D) m.slots[threadIdx.x] = slot;
     add_particles(
         source.nodes, shared, m.slots, in_order,

@@ -36,7 +36,6 @@ class CudaCall {
     schedule_ = schedule_of(in_.schedule, s_.facts);
     if (HeatSteps<T, D>::wanted(in_)) heat_.emplace(s_), heat_->leave_no_record();
     if (ThermalLaws<T, D>::wanted(s_)) thermal_.emplace(s_, heat_ ? &*heat_ : nullptr);
-    s_.laws_are_apart = thermal_ || (heat_ && heat_->heats_by_laws());
   }
 
   // The schedule of the call; after run(), that of its last substeps.
@@ -45,7 +44,7 @@ class CudaCall {
   void run() {
     if (schedule_ == kBlockPerScene) return run_block_per_scene();
     if (in_.n > 1) s_.let_activations_last(stream_);
-    s_.fuse(false);
+    fuse_laws();
     s_.make_pool(stream_);
     s_.count_time(before_, stream_);
     if (schedule_ == kFusedG2P2G) return FusedG2P2G<T, D>(s_, buffers(0), status_, stream_).run(from_, before_);
@@ -116,12 +115,22 @@ class CudaCall {
     if (in_.wants_C) has(in_.C) ? torch::stable::copy_(C_, *in_.C) : torch::stable::zero_(C_);
   }
 
+  // Lets P2G evaluate the laws where it can.
+  void fuse_laws() {
+    s_.thermal.given = thermal_ && thermal_->fit_p2g() && s_.displacements.defined() && in_.apic;
+    s_.laws_are_apart = (thermal_ && !s_.thermal.given) || (heat_ && heat_->heats_by_laws());
+    s_.fuse(false);
+    if (!thermal_ || s_.fused) return;
+    s_.thermal.given = false;
+    thermal_->separate();
+  }
+
   // The second buffers, for schedules with a substep at a time.
   void make_buffers() {
     const bool several = in_.n > 1;
-    laws_move_ = thermal_ && thermal_->may_move() && s_.displacements.defined() && in_.apic && s_.facts.quadratic &&
-                 s_.facts.float32;
-    late_ = laws_move_ || s_.moves_late();
+    laws_move_ = thermal_ && !s_.fused && thermal_->may_move() && s_.displacements.defined() && in_.apic &&
+                 s_.facts.quadratic && s_.facts.float32;
+    late_ = laws_move_ || s_.thermal.given || s_.moves_late();
     x_[1] = result(in_.x, several, {P(), D});
     F_[1] = late_ ? F_[0] : result(in_.x, has(in_.F) && (several || s_.plastic), {P(), D, D});
     J_[1] = late_ ? J_[0] : result(in_.x, has(in_.J) && (several || s_.melts), {P()});
@@ -142,6 +151,7 @@ class CudaCall {
     if (laws_move_) return s_.defer(buffers(into), last);
     if (!late_) return;
     s_.move_late(buffers(into), has_left, last);
+    if (s_.thermal.given) return thermal_->enter_p2g(field<T>(J_[into]), has_left, heat_->volumes());
     if (heat_ && has_left) s_.late.volume = heat_->volumes();
   }
 
@@ -151,11 +161,11 @@ class CudaCall {
     set_particles(into, step_ > 0, last);
     const Particles<T> to = buffers(into);
     if (heat_ && heat_->heats_by_laws()) s_.dissipate(heat_->dissipated());
-    if (thermal_) thermal_->read(field<T>(F_[1 - into]), field<T>(J_[1 - into]));
+    if (thermal_ && !s_.fused) thermal_->read(field<T>(F_[1 - into]), field<T>(J_[1 - into]));
     if (laws_move_) thermal_->move_late(to, step_ > 0, heat_->volumes());
     s_.activate(before_, status(into), on);
     if (heat_ && heat_->begins()) heat_->begin(from_.F, from_.J, s_.p2g.volume, on);
-    thermal_ ? thermal_->run(on) : s_.run_laws(on);
+    thermal_ && !s_.fused ? thermal_->run(on) : s_.run_laws(on);
     if (heat_) heat_->join_g2p(from_.x, s_.p2g.mass, constant(to.C), on);
     if (s_.p2g_is_ahead) s_.p2g.work = {s_.counters, s_.activation.out_of_block_cost, false};
     s_.move(on);
@@ -187,7 +197,7 @@ class CudaCall {
   void begin_next(int into, backend::Stream on) {
     set_particles(into, true, false);
     s_.p2g.work = {s_.counters_of(into), s_.activation.out_of_block_cost, true};
-    s_.fused_kernels.p2g(s_.laws[0], s_.late, s_.p2g, s_.reorder, on);
+    s_.fused_kernels.p2g(s_.laws[0], s_.thermal, s_.late, s_.p2g, s_.reorder, on);
     s_.p2g.work = {};
   }
 
@@ -216,8 +226,9 @@ class CudaCall {
 
   // Computes the substeps from `step_` on. A CUDA graph repeats pairs of them.
   void run_per_step() {
-    goes_ahead_ = heat_ && s_.fused && s_.displacements.defined() && s_.next.emptied && !s_.facts.captured &&
-                  P() <= kMostParticlesAhead;
+    // Laws of temperature read the result of the solve.
+    goes_ahead_ = heat_ && s_.fused && !thermal_ && s_.displacements.defined() && s_.next.emptied &&
+                  !s_.facts.captured && P() <= kMostParticlesAhead;
     const int64_t after = goes_ahead_ ? 2 : 1;  // substeps that have no P2G ahead of the next one
     while (step_ < in_.n) {
       last_ = int(step_ % 2);

@@ -105,7 +105,7 @@ void FusedG2P2G<T, D>::begin(const Particles<const T>& given, const int* before)
   s_.activation.displacement = nullptr;
   s_.activation.next_displacement = displacement(0);
   s_.activate(before, status(0), stream_);
-  s_.fused_kernels.p2g(s_.laws[0], s_.late, s_.p2g, reorder, stream_);
+  s_.fused_kernels.p2g(s_.laws[0], {}, s_.late, s_.p2g, reorder, stream_);
   update_grid(0, stream_);
 }
 
@@ -142,7 +142,7 @@ void FusedG2P2G<T, D>::run_substep(int64_t step, bool ends, backend::Stream stre
   s_.advance.displacement = nowhere();
   backend::g2p_advance(s_.in.lattice.order(), s_.advance, stream);
   s_.activate(status(step - 1), status(step), stream);
-  s_.fused_kernels.p2g(s_.laws[0], s_.late, s_.p2g, s_.reorder, stream);
+  s_.fused_kernels.p2g(s_.laws[0], {}, s_.late, s_.p2g, s_.reorder, stream);
   if (!ends) {
     G2P2GArguments<T, D> a{s_.p2g, s_.late, s_.advance, s_.reorder, s_.reorder.copy, s_.next.items_taken};
     a.advance.displacement = displacement(step);
