@@ -405,6 +405,16 @@ def test_rewards_are_gains_of_the_score(task):
         assert np.abs(np.subtract(now, before)).min() > 10 * rounding
 
 
+@TASKS
+def test_tasks_know_how_scenes_begin(task):
+    env = make(task, 3)
+    env.reset(seed=2)
+    env.step(torch.zeros(3, task.ACTIONS))
+    env.reset(options={"reset_mask": torch.tensor([True, False, True])})
+    for known, computed in zip(env.start(), (env.observation(), env.score()), strict=True):
+        torch.testing.assert_close(known[[0, 2]], computed[[0, 2]], rtol=0, atol=1e-6)
+
+
 def test_a_task_may_change_its_reward():
     class Frugal(envs.Push):
         def reward(self, gain, actions):

@@ -184,6 +184,13 @@ class MaterialEnv(gymnasium.vector.VectorEnv):
         """What each scene has achieved [B]: the reward of a step is the gain of the score."""
         raise NotImplementedError
 
+    def start(self) -> tuple[Tensor, Tensor]:
+        """Observations [B, O] and scores [B] of scenes that begin; those of the others are not used.
+
+        By default `observation` and `score`. A task may know both without a pass over all particles.
+        """
+        return self.observation(), self.score()
+
     def reward(self, gain: Tensor, actions: Tensor) -> Tensor:
         """Rewards [B] of a step by the gain of the score [B] and the actions [B, A]."""
         return gain
@@ -394,8 +401,9 @@ class MaterialEnv(gymnasium.vector.VectorEnv):
     def _begin(self, which: Tensor) -> None:
         """Begin new episodes in the scenes of a mask bool [B]."""
         self._replace(which)
-        self._observation = torch.where(which[:, None], self.observation(), self._observation)
-        self._score = torch.where(which, self.score(), self._score)
+        observation, score = self.start()
+        self._observation = torch.where(which[:, None], observation, self._observation)
+        self._score = torch.where(which, score, self._score)
 
     def _replace(self, which: Tensor) -> None:
         """Replace the scenes of a mask bool [B]. All scenes are drawn, because reading the mask would wait for it."""

@@ -100,9 +100,18 @@ class Write(MaterialEnv):
 
     def observation(self) -> Tensor:
         _, points, _, before = self.parts()
+        return self.observed(clay_around(self.envs.observe("x"), points) / before)
+
+    def observed(self, left: Tensor) -> Tensor:
+        """The observation with shares of the clay that are left around the points [B, M]."""
         stylus = self.positions[:, 0]
-        to_points = (points - stylus[:, None, :2]).flatten(1)
-        return torch.cat([stylus, to_points, clay_around(self.envs.observe("x"), points) / before], 1)
+        to_points = (self.parts()[1] - stylus[:, None, :2]).flatten(1)
+        return torch.cat([stylus, to_points, left], 1)
+
+    def start(self) -> tuple[Tensor, Tensor]:
+        """All clay is left."""
+        around = self.parts()[3]
+        return self.observed(torch.ones_like(around)), -torch.ones_like(around[:, 0])
 
     def score(self) -> Tensor:
         stroke, _, before, _ = self.parts()
