@@ -271,7 +271,9 @@ __device__ Vec4<T> sum_of_warps(const T (*sums)[N], int at) {
 
 // Least number of thread blocks of a multiprocessor; of many items as many threads as in csrc/heat/heat.cu.
 template <int Warps, int Order, class T>
-constexpr int kProductBlocks = Order != 2 || sizeof(T) != 4 ? 2 : Warps == 1 ? 5 : 4;
+constexpr int kProductBlocks = Order != 2 || sizeof(T) != 4 ? 2
+                               : Warps == 1                 ? 5
+                                                            : 4;
 
 // One or several warps for each item share the nodes, and the particles of each cell. `InOrder`: for each base block,
 // with all of its items.
