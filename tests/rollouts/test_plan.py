@@ -106,6 +106,9 @@ DECISIONS = [
     (FEW, {"mirrors": True}, "per_step", None, 64),
     (FEW, {"impulses": True}, "per_step", None, 64),
     (FEW, {"laws": 2}, "per_step", None, 64),
+    (FEW, {"heat": True}, "per_step", 1000, 1000),
+    (FEW, {"heat": True, "blocks_per_scene": 1025}, "per_step", None, 64),
+    (FEW, {"heat": True, "gradients": True}, "per_step", None, 64),
     # Many particles.
     (MANY, {}, "fused_g2p2g", 2**15, 512),
     (MANY, {"max_blocks": 9000}, "fused_g2p2g", 2**15, 256),
