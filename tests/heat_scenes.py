@@ -103,6 +103,11 @@ THERMAL = {
     "expanding sand": lambda: mpm.ThermalExpansion(named("sand")["sand"](), 1e-3),
     "melting": lambda: mpm.Melting(mpm.FixedCorotated(E=1e5, nu=0.3), mpm.WeaklyCompressible(**WATER)),
     "melting and flow": lambda: mpm.Melting(named("von_mises")["von_mises"](), mpm.WeaklyCompressible(**WATER), 0.3),
+    "melting of water": lambda: mpm.Melting(mpm.NeoHookean(E=1e5, nu=0.3), mpm.WeaklyCompressible(1e5), 0.6),
+    "thinning melt": lambda: mpm.Melting(
+        mpm.Hencky(E=1e5, nu=0.3),
+        mpm.WeaklyCompressible(Table([0.0, 6.0], [1e5, 5e4]), 7.0, Table([0.0, 5.0], [10.0, 1.0])),
+    ),
     "wax": lambda: mpm.ThermalExpansion(
         mpm.Melting(mpm.NeoHookean(E=SOFTENING, nu=0.3), mpm.WeaklyCompressible(**WATER), 0.5), 1e-3
     ),

@@ -46,7 +46,8 @@ struct HeatGathered {
   Vector<V, D> moment[Channels];
 };
 
-// Derivatives of a sum by its inputs, which are few; f returns its derivative at dual inputs.
+// Derivatives of a sum by its inputs; f returns its derivative at dual inputs. All evaluations are unrolled, so that
+// the inputs stay in registers; these must be few.
 template <int N, class V, class F>
 MPM_HD void pull_back(const V (&in)[N], V (&grad)[N], const F& f) {
   static_assert(N <= 6);

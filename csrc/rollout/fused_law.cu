@@ -107,7 +107,7 @@ struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true, false> 
     if (law.stress.pointer) store_matrix<D>(at, law.stress, stress);
     return stress;
   }
-  // Both, from the loaded inputs.
+  // The update, and then the stress, from the loaded inputs.
   __device__ Matrix<T, D> stress(int p, const Matrix<T, D>& C, const T& dt, const Parameters& parameters,
                                  Changes& changes) const {
     move(p, C, dt, changes);
@@ -168,9 +168,10 @@ struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true, false> 
   }
 };
 
-// Whether P2G evaluates the law where it reads the temperature.
+// Whether P2G can evaluate the law where its parameters or its material depend on the temperature: it changes neither F
+// nor a history.
 template <class Law>
-constexpr bool kReadsTemperature = kChangesNothing<Law>;
+constexpr bool kFitsThermalP2G = kChangesNothing<Law>;
 
 // What a material is besides its law, where that reads the temperature (rollout/thermal_laws.h).
 template <class T, int D>
@@ -252,18 +253,19 @@ struct ReorderingSource : LawMomentumSource<Law, T, D, true, true> {
     MaterialAtTemperature<T, D> material{thermal, {p}};
     if (reads_temperature()) {
       Base::keep(p, changes);
-      read_temperature(m, C, material, parameters, changes);
+      begin_thermal_law(m, C, material, parameters, changes);
     }
     stress = Base::stress_of_law(p, C, parameters, changes);
-    if (reads_temperature()) return melt(C, material, changes, stress);
+    if (reads_temperature()) return end_thermal_law(C, material, changes, stress);
     const int to = reorder.rows ? reorder.in_other_copy(p, place) : p;
     Base::keep(to, changes);
     if (reorder.rows) write_reordered(p, place, to, m);
   }
-  __device__ bool reads_temperature() const { return kReadsTemperature<Law> && thermal.given; }
-  __device__ void read_temperature(const ParticleMomentum<T, D>& m, const Matrix<T, D>& C,
-                                   MaterialAtTemperature<T, D>& material, Parameters& parameters,
-                                   Changes& changes) const {
+  __device__ bool reads_temperature() const { return kFitsThermalP2G<Law> && thermal.given; }
+  // Replaces the parameters, and F or J, by those that the law reads at the temperature.
+  __device__ void begin_thermal_law(const ParticleMomentum<T, D>& m, const Matrix<T, D>& C,
+                                    MaterialAtTemperature<T, D>& material, Parameters& parameters,
+                                    Changes& changes) const {
 #pragma unroll
     for (int k = 0; k < kParameters<Law>; k++)
       parameters.value[k] = material.parameter(thermal.solid[k], parameters.value[k]);
@@ -272,9 +274,9 @@ struct ReorderingSource : LawMomentumSource<Law, T, D, true, true> {
     else
       changes.J = material.volume_ratio(changes.J);
   }
-  // F and J of a material that melts, and its stress from that of the solid.
-  __device__ void melt(const Matrix<T, D>& C, const MaterialAtTemperature<T, D>& material, Changes& changes,
-                       Matrix<T, D>& stress) const {
+  // Stores F and J of a material that melts, and replaces the stress of its solid by its own.
+  __device__ void end_thermal_law(const Matrix<T, D>& C, const MaterialAtTemperature<T, D>& material, Changes& changes,
+                                  Matrix<T, D>& stress) const {
     if constexpr (Base::moves_F) {
       if (!thermal.melts()) return;
       material.store_J();
@@ -329,7 +331,7 @@ template <class Law, int D>
 void fill_fused(FusedLawKernels<float, D>& kernels) {
   using Launches = FusedLaunches<Law, D>;
   kernels.p2g = Launches::p2g;
-  kernels.reads_temperature = kReadsTemperature<Law>;
+  kernels.reads_temperature = kFitsThermalP2G<Law>;
   kernels.g2p2g = Launches::g2p2g;
 #if CUDART_VERSION >= 13000
   kernels.persistent = Launches::persistent;

@@ -298,9 +298,9 @@ inline bool takes_few_blocks(const PlanFacts& f) {
 }
 
 // The pool and the steps of a call. A pool with all blocks of the domain never has to grow: for few blocks with heat or
-// with the persistent schedule, or if the particles need more memory. The size of a larger pool is checked less often, unless
-// kernels pass over all of its blocks. On deterministic grids the choice is independent of the number of blocks so far,
-// since a second run must equal the first bit by bit.
+// with the persistent schedule, or if the particles need more memory. The size of a larger pool is checked less often,
+// unless kernels pass over all of its blocks. On deterministic grids the choice is independent of the number of blocks
+// so far, since a second run must equal the first bit by bit.
 inline PlannedPool pool_for(const PlanFacts& f) {
   if (!f.cuda) return {-1, kMostSteps};
   if (!f.grows) {

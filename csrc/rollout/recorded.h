@@ -266,7 +266,10 @@ Recorded<T, D>::Recorded(const SubstepsInputs& in, const OptionalTensor& memory,
     heat.emplace(steps);
     first_heat_ = copy_of(heat->state());
   }
-  if (ThermalLaws<T, D>::wanted(steps)) thermal.emplace(steps, heat ? &*heat : nullptr), thermal->separate();
+  if (ThermalLaws<T, D>::wanted(steps)) {
+    thermal.emplace(steps, heat ? &*heat : nullptr);
+    thermal->separate();
+  }
   steps.laws_are_apart = thermal || (heat && heat->heats_by_laws());
   steps.forget_stress();  // each step has its own stress
   steps.fuse(true);

@@ -93,21 +93,22 @@ class ThermalLaws {
     for (size_t k = 0; k < laws_.size(); k++) make_buffers(k);
     // The law of a liquid reads and writes nothing of that of its solid, before which its inputs are computed.
     for (size_t k = 0; k < laws_.size(); k++) s_.laws[k].runs_beside = s_.calls[k].melts;
-    s_.laws_are_apart = true;
   }
 
-  // Whether P2G can evaluate the laws: those of a material of all particles, where a liquid is a fluid.
+  // Whether P2G can evaluate the laws: those of a material of all particles, where a liquid is a fluid. P2G updates and
+  // stores F and J of a material that melts, and of another one the field that its law reads, which then is the only
+  // one.
   bool fit_p2g() const {
     const std::string liquid = has_liquid(0) ? s_.calls[1].law->info.name : "";
     const bool is_fluid = liquid == WeaklyCompressible::name || liquid == ViscousFluid::name;
-    return is_alone() && (liquid.empty() || is_fluid) && s_.fused_kernels.reads_temperature;
+    const bool has_fields = has_liquid(0) ? is_fluid : s_.facts.one_deformation;
+    return is_alone() && has_fields && s_.fused_kernels.reads_temperature;
   }
 
   // Lets P2G evaluate them, of the fields of the last Substeps::read(), and write J of `to`. Present volumes are stored
   // where a G2P has deferred their update (`has_left`).
   void enter_p2g(const Field<T>& J, bool has_left, const Field<T>& present_volume) {
     ThermalP2GArguments<T, D>& a = s_.thermal;
-    a.given = true;
     a.theta = heat_->temperature();
     a.expansion = laws_[0].expansion;
     std::copy_n(laws_[0].parameters, kMostParameters, a.solid);

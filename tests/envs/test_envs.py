@@ -415,6 +415,22 @@ def test_tasks_know_how_scenes_begin(task):
         torch.testing.assert_close(known[[0, 2]], computed[[0, 2]], rtol=0, atol=1e-6)
 
 
+def test_a_task_with_another_score_has_another_start():
+    """Not that of the class that it extends."""
+
+    class Twice(envs.Write):
+        def score(self):
+            return 2 * super().score()
+
+    class Named(envs.Write):
+        """Nothing else is different."""
+
+    env = Twice(1, 0.04)
+    env.reset(seed=0)
+    torch.testing.assert_close(env.start()[1], torch.full((1,), -2.0), rtol=0, atol=1e-6)
+    assert Named.start is envs.Write.start is not envs.MaterialEnv.start
+
+
 def test_a_task_may_change_its_reward():
     class Frugal(envs.Push):
         def reward(self, gain, actions):

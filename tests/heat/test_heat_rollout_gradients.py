@@ -144,10 +144,10 @@ def test_random_combinations(seed, device):
 
 @pytest.mark.parametrize("law", ["neo_hookean", "expansion", "wax"])
 @pytest.mark.parametrize("transfer", ["hybrid", "apic", "flip", "pic"])
-def test_single_precision(transfer, law, device):
-    given, options = (2, torch.float32), {"transfer": transfer, "device": device}
+def test_single_precision(transfer, law, dim, device):
+    given, options = (dim, torch.float32), {"transfer": transfer, "device": device}
     made = tempered(law, *given, **options) if law in THERMAL else scene(*given, melts=True, **options)
-    compare(*made, n=3, tolerance=1e-5)
+    compare(*made, n=3, tolerance=1e-5 if dim == 2 else 3e-5)  # sums over more particles
 
 
 def test_stiff_conduction(device):

@@ -379,12 +379,29 @@ def test_laws_that_read_the_temperature(dim, name, device):
 
 @pytest.mark.parametrize(*in_pairs(name=THERMAL, n=[2, 3, 4, 17], scenes=[1, 3], dim=[2, 3]))
 def test_laws_of_temperature_in_float32(name, n, scenes, dim, device):
-    """On CUDA they update F and J. Scenes have time steps of their own, and a particle is outside the grid."""
+    """On CUDA P2G evaluates most of them. Scenes have time steps of their own, and a particle is outside the grid."""
     step, state = thermal([name], dim, torch.float32, scenes, device=device)
     x = state.x.clone()
     x[3] = 5.0
     dt = torch.linspace(1, 2, scenes) * DT if scenes > 1 else DT
     compare(step, state.replace(x=x), n, dt, tolerance=1e-3)
+
+
+@pytest.mark.parametrize("name", ["softening", "expansion", "expanding fluid", "thinning"])
+def test_laws_of_temperature_beside_a_field_that_they_do_not_read(name, dim, device):
+    """A state has both F and J, for example that of a material that has melted before."""
+    step, state = thermal([name], dim, torch.float32, device=device)
+    P = len(state)
+    F, J = torch.eye(dim).expand(P, dim, dim), torch.linspace(0.99, 1.01, P)
+    compare(step, state.replace(F=F.to(state.x), J=J.to(state.x)), 17, tolerance=1e-3)
+
+
+@pytest.mark.parametrize("name", ["wax", "melting", "thinning melt", "expansion by a table", "thinning"])
+def test_laws_of_temperature_where_particles_leave_their_blocks(name, dim, device):
+    """All move two cells, so that activations of CUDA end in the middle of the call."""
+    step, state = thermal([name], dim, torch.float32, device=device)
+    v = state.v + 2 * step.grid.dx / (60 * DT)
+    compare(step, state.replace(v=v), 60, tolerance=3e-3)
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -45,6 +45,10 @@ class Scenes(NamedTuple):
     fields: Mapping[str, Tensor] = {}
 
 
+OF_START = ("particles", "scenes", "observation", "score")
+"""Methods of a task that decide what `MaterialEnv.start` returns."""
+
+
 class MaterialEnv(gymnasium.vector.VectorEnv):
     """B scenes of a task; the base class of tasks.
 
@@ -90,6 +94,11 @@ class MaterialEnv(gymnasium.vector.VectorEnv):
     OBSERVATIONS: ClassVar[int]
     RANDOM: ClassVar[int] = 0
     MAX_EPISODE_STEPS: ClassVar[int]
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        if "start" not in vars(cls) and not vars(cls).keys().isdisjoint(OF_START):
+            cls.start = MaterialEnv.start  # type: ignore[method-assign]
 
     def __init__(
         self,
@@ -187,7 +196,8 @@ class MaterialEnv(gymnasium.vector.VectorEnv):
     def start(self) -> tuple[Tensor, Tensor]:
         """Observations [B, O] and scores [B] of scenes that begin; those of the others are not used.
 
-        By default `observation` and `score`. A task may know both without a pass over all particles.
+        By default `observation` and `score`. A task may know both without a pass over all particles. A class that
+        defines other particles, scenes, observations or scores has the default again, unless it defines this too.
         """
         return self.observation(), self.score()
 

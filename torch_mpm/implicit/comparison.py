@@ -34,7 +34,7 @@ class Cost(NamedTuple):
 Costs = dict[str, dict[int, Cost]]
 EXPLICIT: Costs = {
     "cpu": {2: Cost(5e-6, 48e-9), 3: Cost(5e-6, 88e-9)},
-    "cuda": {2: Cost(15e-6, 0.14e-9), 3: Cost(15e-6, 0.14e-9)},
+    "cuda": {2: Cost(15e-6, 0.14e-9), 3: Cost(10e-6, 0.1e-9)},
 }
 IMPLICIT: Costs = {
     "cpu": {2: Cost(9e-3, 5e-6), 3: Cost(20e-3, 9e-6)},
@@ -43,8 +43,8 @@ IMPLICIT: Costs = {
 """Costs by kind of device and dimension, explicit steps in one op. CPU: one thread (implicit_crossover_*.md of the
 results); an implicit step costs as much as a hundred explicit ones of as many particles; small ones, more. CUDA: an
 H200 (rollouts_nvidia_h200.md, implicit_crossover_nvidia_h200.md, implicit_cost_nvidia_h200.md); an implicit step costs
-150 explicit ones of millions of particles in 3-D, 470 in 2-D, and a thousand of few particles, where the host is the
-limit.
+210 explicit ones of millions of particles in 3-D, 470 in 2-D, and one or two thousand of few particles, where the host
+is the limit.
 """
 
 

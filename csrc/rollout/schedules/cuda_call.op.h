@@ -115,7 +115,8 @@ class CudaCall {
     if (in_.wants_C) has(in_.C) ? torch::stable::copy_(C_, *in_.C) : torch::stable::zero_(C_);
   }
 
-  // Lets P2G evaluate the laws where it can.
+  // Lets P2G evaluate the laws where it can. Laws of temperature need an activation that lasts and APIC there, because
+  // P2G updates F and J by the affine field.
   void fuse_laws() {
     s_.thermal.given = thermal_ && thermal_->fit_p2g() && s_.displacements.defined() && in_.apic;
     s_.laws_are_apart = (thermal_ && !s_.thermal.given) || (heat_ && heat_->heats_by_laws());
@@ -197,7 +198,7 @@ class CudaCall {
   void begin_next(int into, backend::Stream on) {
     set_particles(into, true, false);
     s_.p2g.work = {s_.counters_of(into), s_.activation.out_of_block_cost, true};
-    s_.fused_kernels.p2g(s_.laws[0], s_.thermal, s_.late, s_.p2g, s_.reorder, on);
+    s_.fused_kernels.p2g(s_.laws[0], {}, s_.late, s_.p2g, s_.reorder, on);
     s_.p2g.work = {};
   }
 
