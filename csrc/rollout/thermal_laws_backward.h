@@ -106,7 +106,7 @@ MPM_HD void end_laws_backward(const ThermalLawsBackwardArguments<T, D>& a, int64
     store_scalar(at, a.elastic_J, volume.value * adjoint);
   }
   stretch_backward(a, at, by_factor);
-  if (forward.coherency.knots > 0) stress_backward(a, at);
+  if (forward.melts()) stress_backward(a, at);
 }
 
 // Adjoint of F and J that laws read.
@@ -118,7 +118,7 @@ MPM_HD void elastic_backward(const ThermalLawsBackwardArguments<T, D>& a, const 
   if (a.elastic_F.pointer)
     given.F = load_matrix<D>(at, forward.F), adjoint.F = load_matrix<D>(at, constant(a.elastic_F));
   if (a.elastic_J.pointer) given.J = load_scalar(at, forward.J), adjoint.J = load_scalar(at, constant(a.elastic_J));
-  if (forward.coherency.knots > 0)
+  if (forward.melts())
     adjoint =
         phases_backward<T, D>({volume.value * given.J, factor.value * given.F}, has_collapsed(forward, at), adjoint);
   T by_factor = T(0);
