@@ -9,6 +9,7 @@ namespace mpm {
 // Trilinear forms of particles and nodes whose position gradients belong to the step: those of P2G, in the order of
 // HeatChannel, those of G2P, and the two of λ · H (θ + d).
 enum HeatForm : int { kHeatIncrement = kHeatChannels, kHeatAverage, kHeatAfter, kHeatMultiplier, kHeatForms };
+constexpr int kHeatSolved = kHeatForms - kHeatChannels;  // forms after those of P2G
 
 // Columns of the adjoints of the parameters.
 enum HeatParameter : int { kConductivity, kSpecificHeat, kMeltingPoint, kLatentHeat, kPower, kHeatParameters };
@@ -81,9 +82,10 @@ struct HeatNodesBackwardArguments {
   double dt = 0;
   const T* temperature = nullptr;  // of the held surface in scene b at temperature + b * stride, absent without one
   int64_t stride = 0;
-  T* layer = nullptr;  // [N], adjoint of its exchange
-  T* forms = nullptr;  // [N, kHeatForms]: adjoints of the sums; increment, θ̄, θ + d and λ
-  T* rate = nullptr;   // λ d/dt², whose sum with the heat capacities is the adjoint of dt; may be absent
+  T* layer = nullptr;    // [N], adjoint of its exchange
+  T* by_sums = nullptr;  // [N, kHeatChannels], adjoints of the sums
+  T* solved = nullptr;   // [N, kHeatSolved]: increment, θ̄, θ + d and λ
+  T* rate = nullptr;     // λ d/dt², whose sum with the heat capacities is the adjoint of dt; may be absent
 };
 
 // Adjoint of the layer of particles around a held surface.

@@ -22,7 +22,6 @@ MPM_BACKEND_KERNELS(MPM_HEAT_KERNELS)
   PLAIN(heat_nodes, HeatNodesArguments)                 \
   ORDERED(heat_surface, HeatSurfaceArguments)           \
   PLAIN(heat_hold, HeatHoldArguments)                   \
-  PLAIN(heat_increments, HeatIncrementsArguments)       \
   ORDERED(heat_to_particles, HeatToParticlesArguments)
 MPM_BACKEND_KERNELS(MPM_HEAT_TRANSFER_KERNELS)
 

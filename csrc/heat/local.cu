@@ -77,18 +77,12 @@ void heat_nodes(const HeatNodesArguments<T, D>& a, Stream stream) {
 }
 
 template <class T, int D>
-void heat_increments(const HeatIncrementsArguments<T, D>& a, Stream stream) {
-  for_each<heat_increment<T, D>>(a.nodes, a, stream);
-}
-
-template <class T, int D>
 void heat_hold(const HeatHoldArguments<T, D>& a, Stream stream) {
   for_each<hold<T, D>>(nodes_of(a.topology), a, stream);
 }
 
 MPM_INSTANTIATE(heat_volumes, HeatVolumesArguments)
 MPM_INSTANTIATE(heat_nodes, HeatNodesArguments)
-MPM_INSTANTIATE(heat_increments, HeatIncrementsArguments)
 MPM_INSTANTIATE(heat_finish, HeatFinishArguments)
 MPM_INSTANTIATE(heat_hold, HeatHoldArguments)
 

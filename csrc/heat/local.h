@@ -120,11 +120,6 @@ MPM_HD void finish_node(const HeatFinishArguments<T, D>& a, int scene, int64_t i
   if (solve.sums) sum[kHeatMean] = mean_of(sum[kHeatMean], sum[kHeatVarying]);
 }
 
-template <class T, int D>
-MPM_HD void heat_increment(const HeatIncrementsArguments<T, D>& a, int64_t i) {
-  a.sums[i * kHeatChannels + kHeatTheta] = a.increment[i] + (a.start[i] - a.theta[i]);
-}
-
 // Whether an obstacle that acts contains a node of a block.
 template <class T, int D>
 MPM_HD bool is_held(const HeatHoldArguments<T, D>& a, const ObstaclePose<T, D>& pose, const int (&corner)[D],

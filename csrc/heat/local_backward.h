@@ -250,15 +250,16 @@ MPM_HD void heat_of_node_backward(const HeatNodesBackwardArguments<T, D>& a, int
   const T adjoint[] = {-rate, T(0), by_theta, a.adjoints[2 * i + 1]};
   T grad[Means::kIn];
   Means::pull_back(in, adjoint, [](int) { return true; }, [&](int n, const T& value) { grad[n] = value; });
-  T* const form = a.forms + i * kHeatForms;
-  form[kHeatTheta] = grad[0];
-  form[kHeatMean] = grad[1];
-  form[kHeatCapacity] = grad[2];
-  form[kHeatVarying] = grad[3];
-  form[kHeatIncrement] = increment;
-  form[kHeatAverage] = average;
-  form[kHeatAfter] = theta + increment;
-  form[kHeatMultiplier] = multiplier;
+  T* const by_sums = a.by_sums + i * kHeatChannels;
+  by_sums[kHeatTheta] = grad[0];
+  by_sums[kHeatMean] = grad[1];
+  by_sums[kHeatCapacity] = grad[2];
+  by_sums[kHeatVarying] = grad[3];
+  T* const solved = a.solved + i * kHeatSolved - kHeatChannels;
+  solved[kHeatIncrement] = increment;
+  solved[kHeatAverage] = average;
+  solved[kHeatAfter] = theta + increment;
+  solved[kHeatMultiplier] = multiplier;
   if (a.rate) a.rate[i] = rate / dt;
   if (a.layer) a.layer[i] = multiplier * (a.temperature[scene * a.stride] - (theta + increment));
 }

@@ -51,14 +51,6 @@ void heat_surface(const HeatSurfaceArguments<T, D>& a) {
       });
 }
 
-template <class T, int D>
-void heat_increments(const HeatIncrementsArguments<T, D>& a) {
-  constexpr int64_t grain = 16384;  // nodes below which a range is not split
-  parallel_ranges(a.nodes, grain, [&](int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; i++) heat_increment(a, i);
-  });
-}
-
 template <int Order, class T, int D>
 void heat_to_particles(const HeatToParticlesArguments<T, D>& a) {
   using P = Lanes<T>;
@@ -87,7 +79,6 @@ void heat_to_particles(const HeatToParticlesArguments<T, D>& a) {
 MPM_INSTANTIATE(heat_volumes, HeatVolumesArguments)
 MPM_INSTANTIATE_ORDERS(heat_to_nodes, HeatToNodesArguments)
 MPM_INSTANTIATE_ORDERS(heat_surface, HeatSurfaceArguments)
-MPM_INSTANTIATE(heat_increments, HeatIncrementsArguments)
 MPM_INSTANTIATE_ORDERS(heat_to_particles, HeatToParticlesArguments)
 
 }  // namespace TORCH_MPM_ISA

@@ -89,17 +89,6 @@ struct HeatMeansArguments {
   HeatCleared<T> cleared;
 };
 
-// Replaces w θ in the sums by the change of the temperatures: the increments of the solve, from `start` on, which
-// differs from the average `theta` where nodes are held.
-template <class T, int D>
-struct HeatIncrementsArguments {
-  int64_t nodes = 0;
-  const T* increment = nullptr;
-  const T* start = nullptr;
-  const T* theta = nullptr;
-  T* sums = nullptr;
-};
-
 template <class T, int D>
 struct HeatToParticlesArguments {
   Topology<T, D> topology;

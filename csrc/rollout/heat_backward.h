@@ -29,6 +29,7 @@ class HeatBackward {
   void run(int64_t i, const HeatAdjoints& adjoints) {
     const HeatSolution<T, D> solution = record_.conduct_again(i);
     make_nodes(solution);
+    backend::clear(zero_, stream_);
     HeatToParticlesBackwardArguments<T, D> up = to_particles(solution, adjoints);
     backend::heat_to_particles_backward(order(), up, stream_);
     scatter(up);
@@ -77,7 +78,9 @@ class HeatBackward {
   backend::Stream stream_;
   Tensor value_, moment_, blend_, rate_of_particles_;  // [P, kHeatForms], [P, kHeatForms, D], [P], [P, 1]
   int64_t nodes_ = -1;
-  Tensor adjoints_, source_, multiplier_, product_, products_, forms_, rate_;  // of the nodes
+  // Of the nodes: memory that is zero when the adjoint of a step begins, with the next three; the others.
+  Tensor zero_, adjoints_, product_, products_;
+  Tensor source_, multiplier_, by_sums_, solved_, rate_;
   Tensor slot_sums_, counted_;  // of the numbers of the boundary, by slots; nodes that are held
   // Adjoints of the sums of the free surface, and of θ by the terms; [P, 1 + D], [P, 1 + D, D].
   Tensor surface_, by_terms_, surface_value_, surface_gradient_;
@@ -116,10 +119,13 @@ void HeatBackward<T, D>::make_nodes(const HeatSolution<T, D>& solution) {
   const int64_t nodes = int64_t(solution.system.topology.max_blocks) * kBlockNodes<D>;
   if (nodes == nodes_) return;
   nodes_ = nodes;
-  for (Tensor* t : {&source_, &multiplier_, &product_, &rate_}) *t = empty(in_.x, {nodes});
-  adjoints_ = empty(in_.x, {nodes, 2});
-  products_ = empty(in_.x, {kMostSimpleSteps, nodes});
-  forms_ = empty(in_.x, {nodes, kHeatForms});
+  zero_ = empty(in_.x, {2 + 1 + kMostSimpleSteps, nodes});
+  adjoints_ = torch::stable::view(torch::stable::narrow(zero_, 0, 0, 2), {nodes, 2});
+  product_ = torch::stable::narrow(zero_, 0, 2, 1);
+  products_ = torch::stable::narrow(zero_, 0, 3, kMostSimpleSteps);
+  for (Tensor* t : {&source_, &multiplier_, &rate_}) *t = empty(in_.x, {nodes});
+  by_sums_ = empty(in_.x, {nodes, kHeatChannels});
+  solved_ = empty(in_.x, {nodes, kHeatSolved});
   if (heat().holds_surface()) layer_ = empty(in_.x, {nodes});
   if (heat().has_terms()) surface_ = empty(in_.x, {nodes, kHeatChannels}), by_terms_ = empty(in_.x, {nodes});
   workspace_ = operator_workspace_ = Tensor();
@@ -145,7 +151,6 @@ HeatToParticlesBackwardArguments<T, D> HeatBackward<T, D>::to_particles(const He
 // Adjoints of the increments and of θ̄.
 template <class T, int D>
 void HeatBackward<T, D>::scatter(const HeatToParticlesBackwardArguments<T, D>& up) {
-  backend::clear(adjoints_, stream_);
   ScatterArguments<T, D> a;
   a.topology = up.forward.topology;
   a.x = up.forward.x;
@@ -170,7 +175,6 @@ void HeatBackward<T, D>::solve(HeatArguments<T, D> system, const Tensor& status)
   system.converged = static_cast<bool*>(converged_.data_ptr());
   if (!workspace_.defined()) workspace_ = empty(in_.x, {backend::heat_workspace(system, stream_)}, ScalarType::Byte);
   system.workspace = workspace_.data_ptr();
-  backend::clear(products_, stream_);
   HeatFinishArguments<T, D> finish;
   finish.simple.solve = system;
   for (int k = 0; k < kMostSimpleSteps; k++) finish.simple.product[k] = rows(products_) + k * nodes_;
@@ -182,7 +186,6 @@ void HeatBackward<T, D>::solve(HeatArguments<T, D> system, const Tensor& status)
 // H λ.
 template <class T, int D>
 void HeatBackward<T, D>::multiply(const HeatArguments<T, D>& system) {
-  backend::clear(product_, stream_);
   HeatOperatorArguments<T, D> a;
   a.topology = system.topology;
   a.x = system.x;
@@ -246,7 +249,7 @@ void HeatBackward<T, D>::adjoint_of_surface_temperature(const HeatSolution<T, D>
   ScatterArguments<T, D> a;
   a.topology = solution.down.topology;
   a.x = solution.down.x;
-  a.value = field<const T>(heat().exchange_of_particles());
+  a.value = constant(heat().exchange_of_particles());
   a.deterministic = in_.lattice.deterministic();
   a.nodes = {rows(layer_exchange_), 1, 1};
   backend::scatter(order(), a, stream_);
@@ -274,7 +277,8 @@ void HeatBackward<T, D>::adjoint_of_nodes(const HeatSolution<T, D>& solution, bo
   }
   a.scene_dt = solution.down.scene_dt;
   a.dt = solution.down.dt;
-  a.forms = rows(forms_);
+  a.by_sums = rows(by_sums_);
+  a.solved = rows(solved_);
   if (by_dt) a.rate = rows(rate_);
   backend::heat_nodes_backward(a, stream_);
 }
@@ -286,7 +290,7 @@ void HeatBackward<T, D>::gather(const HeatToNodesArguments<T, D>& down, bool by_
   GatherArguments<T, D> a;
   a.topology = down.topology;
   a.x = down.x;
-  a.nodes = {rows(forms_) + kHeatAfter, kHeatForms, 2};
+  a.nodes = {rows(solved_) + (kHeatAfter - kHeatChannels), kHeatSolved, 2};
   a.moment_scale = in_.lattice.inverse_inertia();
   a.moment = forms(moment_, kHeatAfter);
   backend::gather(order(), a, stream_);
@@ -314,7 +318,7 @@ HeatToNodesBackwardArguments<T, D> HeatBackward<T, D>::to_nodes(int64_t i, const
   a.rest = record_.steps.p2g.volume;
   a.F = before.F;
   a.J = before.J;
-  a.nodes = {rows(forms_), kHeatForms, kHeatChannels};
+  a.nodes = {rows(by_sums_), kHeatChannels, kHeatChannels};
   a.blend = field<const T>(blend_);
   if (adjoints.dt.defined()) a.rate = constant(HeatSteps<T, D>::column_of(rate_of_particles_, 0));
   a.inverse_inertia = in_.lattice.inverse_inertia();
@@ -378,7 +382,7 @@ void HeatBackward<T, D>::adjoint_of_surface(int64_t i, const HeatLayersBackwardA
                      stream_);
 }
 
-// Of all forms: those of the step at once, those of the free surface, and that of the exchange of a held surface.
+// Of all forms: those of P2G and of the solve, those of the free surface, and that of the exchange of a held surface.
 template <class T, int D>
 void HeatBackward<T, D>::position_gradient(const HeatToNodesArguments<T, D>& down) {
   PositionGradientArguments<T, D> a;
@@ -386,13 +390,17 @@ void HeatBackward<T, D>::position_gradient(const HeatToNodesArguments<T, D>& dow
   a.x = down.x;
   a.value = field<const T>(value_);
   a.moment = field<const T>(moment_);
-  a.nodes = {rows(forms_), kHeatForms, kHeatForms};
+  a.nodes = {rows(by_sums_), kHeatChannels, kHeatChannels};
   a.position_gradient = field<T>(x_term);
   backend::position_gradient(order(), a, stream_);
-  a.moment = {};
   a.adds = true;
+  a.value = constant(forms(value_, kHeatIncrement));
+  a.moment = constant(forms(moment_, kHeatIncrement));
+  a.nodes = {rows(solved_), kHeatSolved, kHeatSolved};
+  backend::position_gradient(order(), a, stream_);
+  a.moment = {};
   if (heat().holds_surface()) {
-    a.value = field<const T>(heat().exchange_of_particles());
+    a.value = constant(heat().exchange_of_particles());
     a.nodes = {rows(layer_), 1, 1};
     backend::position_gradient(order(), a, stream_);
     const Field<T> sum = field<T>(x_term);

@@ -5,6 +5,7 @@
 #include <optional>
 
 #include "heat/kernels.h"
+#include "rollout/arena.h"
 #include "rollout/own_field.h"
 #include "rollout/step_kernels.h"
 
@@ -18,6 +19,22 @@ struct HeatSolution {
   HeatToNodesArguments<T, D> down;
   HeatArguments<T, D> system;
   const T* theta;  // averages of the nodes [N]; null where the solve reads their sums
+};
+
+// Memory of a step at the nodes; absent parts are null.
+template <class T>
+struct HeatNodeMemory {
+  // Zero when the step begins: the largest diffusion number of a particle in each scene; the sums of the nodes, their
+  // exchange and source, the sums of the surface, and the products of the simple steps. On the CPU also: slots to which
+  // particles are transferred.
+  double* largest = nullptr;
+  T *sums = nullptr, *exchange = nullptr, *source = nullptr, *surface = nullptr;
+  T* product[kMostSimpleSteps] = {};
+  bool* matter = nullptr;
+  // Averages of the temperature, heat capacities, increments of the solve, and where nodes may be held the temperatures
+  // before these increments, and whether nodes are held.
+  T *theta = nullptr, *capacity = nullptr, *increment = nullptr, *start = nullptr;
+  bool* fixed = nullptr;
 };
 
 // Solves by simple steps where these suffice, and the other scenes by conjugate gradients.
@@ -56,6 +73,24 @@ class HeatSteps {
 
   // Steps leave nothing for an adjoint: neither increments nor averages of the nodes.
   void leave_no_record() { for_record_ = false; }
+
+  // Lets the next step read fields of a record, and write others.
+  void use_fields(const Tensor& before, const Tensor& after) { fields.use(before, after); }
+  // Lets the next step use memory of a record: at the nodes, and of the transfer to them at the particles
+  // [P, transfer_columns()]. Without memory it uses that of the call.
+  void use_memory(const HeatNodeMemory<T>& nodes, const Tensor& of_transfer) {
+    nodes_ = nodes;
+    of_transfer_ = of_transfer;
+    is_recorded_ = true;
+  }
+  void use_own_memory() {
+    if (is_recorded_) of_transfer_ = absent();
+    is_recorded_ = false;
+  }
+  // Lays out the memory of a step at the nodes of a pool: what is zero when the step begins, and the rest.
+  HeatNodeMemory<T> lay_out(int64_t slots, Arena& zero, Arena& rest) const;
+  int transfer_columns() const { return kNumber + melts() + holds_surface(); }
+  int columns_of_fields() const { return columns_; }
 
   // Whether begin() is needed: the present volumes are not stored yet, or laws store what they dissipate.
   bool begins() const { return !has_volumes_ || heats_by_laws(); }
@@ -99,16 +134,16 @@ class HeatSteps {
     fields.go(true);
   }
 
-  // The part of a substep up to the node temperatures, with the increments of an earlier solve where they are known.
+  // The part of a substep up to the node temperatures.
   HeatSolution<T, D> conduct(const Field<const T>& x, const Field<const T>& mass, const Field<const T>& rest,
                              const Field<const T>& velocity_gradient, const Field<const int>& scene,
-                             backend::Stream stream, const T* known = nullptr) {
+                             backend::Stream stream) {
     HeatToNodesArguments<T, D> down = s_.with_heat.to_nodes;
     if (!down.sums.pointer) {
       down = begin_nodes(x, mass, velocity_gradient, stream);
       backend::heat_to_nodes(in_.lattice.order(), down, stream);
     }
-    return conduct(down, rest, scene, stream, known);
+    return conduct(down, rest, scene, stream);
   }
 
   // The transfer to the nodes, whose sums are zero.
@@ -119,17 +154,20 @@ class HeatSteps {
   }
   // That part after the transfer to the nodes.
   HeatSolution<T, D> conduct(const HeatToNodesArguments<T, D>& down, const Field<const T>& rest,
-                             const Field<const int>& scene, backend::Stream stream, const T* known = nullptr) {
+                             const Field<const int>& scene, backend::Stream stream) {
     const Field<const T>& x = down.x;
     if (holds_surface()) add_layers(x, scene, stream);
     if (has_terms()) backend::heat_surface(in_.lattice.order(), surface(x, rest), stream);
     if (!solves_for_sums()) backend::heat_nodes(nodes(), stream);
-    HeatArguments<T, D> a = equations(x, stream);
-    if (known)
-      use_increments(a, known, stream);
-    else
-      solve(a, stream);
-    return {down, a, averages()};
+    for (int64_t k = 0; k < held_nodes(); k++) backend::heat_hold(hold(k, nodes_.capacity), stream);
+    HeatArguments<T, D> a = equations(x);
+    solve(a, stream);
+    return {down, a, nodes_.theta};
+  }
+  // The same of a step whose memory has the results.
+  HeatSolution<T, D> solution(const Field<const T>& x, const Field<const T>& mass,
+                              const Field<const T>& velocity_gradient) {
+    return {to_nodes(x, mass, velocity_gradient), equations(x), nodes_.theta};
   }
 
   // The transfer of these temperatures to the particles, to the other buffer of the fields or in place.
@@ -155,12 +193,6 @@ class HeatSteps {
   // The columns of a tensor in the order of the fields.
   static Field<T> column_of(const Tensor& t, int first) { return column(field<T>(t), first); }
   int gradient_column() const { return gradient_; }
-  const Tensor& increments() const { return increment_; }  // of the latest solve [N]
-  // The energy that laws have dissipated in a step, before its `run` [P, 1].
-  Tensor dissipated_energy() const {
-    Tensor all = fields.tensor();
-    return torch::stable::narrow(all, 1, dissipated_, 1);
-  }
 
   // The terms of the free surface, and heat from inside the matter; and what they read of the particles.
   bool has_terms() const { return !in_.heat_terms.empty() || has_power() || heats_by_laws(); }
@@ -173,7 +205,7 @@ class HeatSteps {
   HeatHoldArguments<T, D> hold(int64_t k, const T* capacity) const;
   HeatLayersArguments<T, D> layers(const Field<const T>& x, const Field<const int>& scene) const;
   HeatFromSurfaceArguments<T, D> from_surface() const;
-  const Tensor& exchange_of_particles() const { return exchange_of_particles_; }
+  Field<T> exchange_of_particles() const { return holds_surface() ? transfer_column(kNumber + melts()) : Field<T>{}; }
 
  private:
   int64_t particles() const { return in_.x.size(0); }
@@ -188,7 +220,10 @@ class HeatSteps {
   bool solves_for_sums() const { return !for_record_ && !exchanges() && held_nodes() == 0; }
   // Whether G2P packs the particles for the simple steps; a held surface changes their conductance after it.
   bool packs_in_g2p() const { return !holds_surface(); }
-  const T* averages() const { return theta_.defined() ? static_cast<const T*>(theta_.data_ptr()) : nullptr; }
+  // Columns of what the transfer to the nodes stores at the particles: the diffusion number where particles melt, and
+  // then their exchange with a held surface.
+  enum TransferColumn : int { kConductance, kBlend, kNumber };
+  Field<T> transfer_column(int k) const { return column(field<T>(of_transfer_), k); }
   double* rows_of_status() const { return static_cast<double*>(status.data_ptr()); }
   const T* held_temperature(int64_t k) const { return temperatures_.pointer + k * temperatures_.stride[0]; }
 
@@ -212,43 +247,35 @@ class HeatSteps {
   HeatNodesArguments<T, D> nodes() const;
   HeatCleared<T> next_cleared() const;
   void add_layers(const Field<const T>& x, const Field<const int>& scene, backend::Stream stream);
-  void hold_nodes(HeatArguments<T, D>& a, backend::Stream stream);
   void read_parameter(const Tensor& t, const char* name);
   HeatValue<T> value(size_t k) const;
   // Slots with nodes in use. On the CPU those with a block are first, where the activation counts them.
-  int64_t used_slots() const { return s_.activation.used_slots ? s_.used_slots : slots_; }
+  int64_t used_slots() const { return s_.activation.used_slots ? s_.used_slots : s_.activation.slots(); }
   void make_nodes(backend::Stream stream);
+  void make_own_nodes(backend::Stream stream);
   void* workspace(backend::Stream stream);
-  int64_t lay_out_cleared(T* memory, int64_t nodes);
   HeatToNodesArguments<T, D> to_nodes(const Field<const T>& x, const Field<const T>& mass,
                                       const Field<const T>& velocity_gradient) const;
-  HeatArguments<T, D> equations(const Field<const T>& x, backend::Stream stream);
+  HeatArguments<T, D> equations(const Field<const T>& x) const;
   void solve(HeatArguments<T, D>& a, backend::Stream stream);
-  void use_increments(const HeatArguments<T, D>& a, const T* increments, backend::Stream stream);
 
   Substeps<T, D>& s_;
   const SubstepsInputs& in_;
-  int gradient_ = -1, liquid_ = -1, volume_ = 1, dissipated_ = -1;  // columns
+  int gradient_ = -1, liquid_ = -1, volume_ = 1, dissipated_ = -1, columns_ = 0;  // columns, and their number
   std::vector<HeatValue<T>> values_;  // of the parameters; those per particle have no pointer
   std::vector<int> own_;              // index in `parameters`, or -1
-  Tensor conductance_, blend_, number_;
-  bool has_volumes_ = false, for_record_ = true;
+  Tensor of_transfer_ = absent();     // [P, transfer_columns()]
+  bool has_volumes_ = false, for_record_ = true, is_recorded_ = false;
   HeatVolumesArguments<T, D> volumes_after_;
-  Field<const T> temperatures_;   // of the held obstacles [K, B]
-  Tensor exchange_of_particles_;  // with the held surface
-  Tensor start_, fixed_;
-  size_t power_ = 0;  // its number among the parameters
+  Field<const T> temperatures_;  // of the held obstacles [K, B]
+  size_t power_ = 0;             // its number among the parameters
+  HeatNodeMemory<T> nodes_;
+  // Memory of the call; what is zero when a substep begins is used in turn.
   int64_t slots_ = -1;
-  // Memory that is zero when a substep begins, used in turn: the largest diffusion number of a particle in each scene;
-  // and by nodes the sums, exchange and source, the sums of the surface, and the products of the simple steps.
   static constexpr int kTurns = MPM_BACKEND == MPM_BACKEND_IS_cuda ? 2 : 1;
-  Tensor cleared_[kTurns];
+  Tensor zero_[kTurns], rest_;
   int turn_ = 0;
-  double* largest_ = nullptr;
-  T *sums_ = nullptr, *exchange_ = nullptr, *source_ = nullptr, *surface_ = nullptr;
-  T* product_[kMostSimpleSteps] = {};
-  Tensor theta_, capacity_, increment_, iterations_, residual_, converged_, workspace_;
-  Tensor matter_;  // on the CPU: slots to which particles are transferred
+  Tensor iterations_, residual_, converged_, workspace_;
 };
 
 template <class T, int D>
@@ -279,9 +306,6 @@ HeatSteps<T, D>::HeatSteps(Substeps<T, D>& steps) : s_(steps), in_(steps.in) {
     if (k < tensors) read_parameter(in_.heat[k], element("heat", int(k)).c_str());
   power_ = values_.size();
   if (has_power()) read_parameter(in_.heat_boundaries[kPower], "the power of heat");
-  conductance_ = empty(x, {P});
-  blend_ = empty(x, {P});
-  if (melts()) number_ = empty(x, {P});
   status = empty(x, {in_.scenes, int64_t(kHeatStatusSize)}, ScalarType::Double);
   torch::stable::zero_(status);
   iterations_ = empty_int(x, {in_.scenes});
@@ -298,6 +322,7 @@ void HeatSteps<T, D>::pack() {
   if (in_.heat.size() >= 6) liquid_ = columns++;
   volume_ = columns++;
   if (in_.heat_scalars[2] > 0) dissipated_ = columns++;
+  columns_ = columns;
   Tensor packed = empty_particles(x, {P, columns});
   torch::stable::zero_(packed);
   const auto put = [&](const Tensor& t, const char* name, int first, int width) {
@@ -324,7 +349,6 @@ void HeatSteps<T, D>::check_held() {
   check_shape(in_.heat_boundaries[kHeld], "the held temperatures", {count, in_.scenes});
   check_like(in_.heat_boundaries[kHeld], "the held temperatures", in_.x);
   temperatures_ = field<const T>(in_.heat_boundaries[kHeld]);
-  if (holds_surface()) exchange_of_particles_ = empty(in_.x, {particles(), 1});
 }
 
 // The layer of particles near the held surface.
@@ -340,15 +364,15 @@ HeatLayersArguments<T, D> HeatSteps<T, D>::layers(const Field<const T>& x, const
   a.obstacle = int(in_.held_obstacles.back());
   a.width = kWidth * in_.lattice.dx();
   a.inverse_inertia = in_.lattice.inverse_inertia();
-  a.conductance = field<T>(conductance_);
-  a.exchange = column(field<T>(exchange_of_particles_), 0);
+  a.conductance = transfer_column(kConductance);
+  a.exchange = exchange_of_particles();
   return a;
 }
 
 // The rest of the conductance in the layer, and its exchange, which is added to the nodes.
 template <class T, int D>
 void HeatSteps<T, D>::add_layers(const Field<const T>& x, const Field<const int>& scene, backend::Stream stream) {
-  const NodeField<T> nodes{exchange_, 1, 1, s_.tile_memory()};
+  const NodeField<T> nodes{nodes_.exchange, 1, 1, s_.tile_memory()};
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda
   const HeatExchangeArguments<T, D> both{layers(x, scene), s_.p2g.topology, nodes, in_.lattice.deterministic()};
   backend::heat_exchange(in_.lattice.order(), both, stream);
@@ -357,7 +381,7 @@ void HeatSteps<T, D>::add_layers(const Field<const T>& x, const Field<const int>
   ScatterArguments<T, D> down;
   down.topology = s_.p2g.topology;
   down.x = x;
-  down.value = field<const T>(exchange_of_particles_);
+  down.value = constant(exchange_of_particles());
   down.deterministic = in_.lattice.deterministic();
   down.nodes = nodes;
   backend::scatter(in_.lattice.order(), down, stream);
@@ -367,8 +391,8 @@ void HeatSteps<T, D>::add_layers(const Field<const T>& x, const Field<const int>
 // Heat from the held surface.
 template <class T, int D>
 HeatFromSurfaceArguments<T, D> HeatSteps<T, D>::from_surface() const {
-  return {s_.p2g.topology, held_temperature(int64_t(in_.held_obstacles.size()) - 1), temperatures_.stride[1], exchange_,
-          source_};
+  return {s_.p2g.topology, held_temperature(int64_t(in_.held_obstacles.size()) - 1), temperatures_.stride[1],
+          nodes_.exchange, nodes_.source};
 }
 
 // The nodes in a held obstacle.
@@ -380,18 +404,8 @@ HeatHoldArguments<T, D> HeatSteps<T, D>::hold(int64_t k, const T* capacity) cons
           held_temperature(k),
           temperatures_.stride[1],
           capacity,
-          static_cast<T*>(start_.data_ptr()),
-          static_cast<bool*>(fixed_.data_ptr())};
-}
-
-// Sets which nodes stay at which temperatures.
-template <class T, int D>
-void HeatSteps<T, D>::hold_nodes(HeatArguments<T, D>& a, backend::Stream stream) {
-  T* const start = static_cast<T*>(start_.data_ptr());
-  bool* const fixed = static_cast<bool*>(fixed_.data_ptr());
-  for (int64_t k = 0; k < held_nodes(); k++) backend::heat_hold(hold(k, a.heat_capacity), stream);
-  a.theta = start;
-  a.fixed = fixed;
+          nodes_.start,
+          nodes_.fixed};
 }
 
 template <class T, int D>
@@ -413,61 +427,61 @@ HeatValue<T> HeatSteps<T, D>::value(size_t k) const {
   return {f.pointer, f.stride[0], false};
 }
 
-// Makes the node tensors for the size of the pool. Some are zero when a substep begins; on CUDA a substep clears those
-// of the next one, in another kernel's pass over the nodes.
+// Makes the memory of the call for the size of the pool. On CUDA a substep clears that of the next one, in another
+// kernel's pass over the nodes.
 template <class T, int D>
-void HeatSteps<T, D>::make_nodes(backend::Stream stream) {
-  const int64_t slots = s_.activation.slots(), nodes = slots * kBlockNodes<D>;
+void HeatSteps<T, D>::make_own_nodes(backend::Stream stream) {
+  const int64_t slots = s_.activation.slots();
+  if (!of_transfer_.defined()) of_transfer_ = empty_particles(in_.x, {particles(), transfer_columns()});
   if (slots != slots_) {
     slots_ = slots;
-    if (!solves_for_sums()) theta_ = empty(in_.x, {nodes}), capacity_ = empty(in_.x, {nodes});
-    increment_ = empty(in_.x, {nodes});
-    if (held_nodes() > 0) start_ = empty(in_.x, {nodes}), fixed_ = empty(in_.x, {nodes}, ScalarType::Bool);
-    workspace_ = Tensor();
-#if MPM_BACKEND == MPM_BACKEND_IS_cpu
-    matter_ = empty(in_.x, {slots}, ScalarType::Bool);
-    backend::clear(matter_, stream);
-#endif
-    for (int turn = 0; turn < kTurns; turn++) {
-      cleared_[turn] = empty(in_.x, {lay_out_cleared(nullptr, nodes)});
-      backend::clear(cleared_[turn], stream);
+    Arena zero, rest;
+    lay_out(slots, zero, rest);
+    rest_ = empty(in_.x, {rest.size()}, ScalarType::Byte);
+    for (Tensor& turn : zero_) {
+      turn = empty(in_.x, {zero.size()}, ScalarType::Byte);
+      backend::clear(turn, stream);
     }
+    workspace_ = Tensor();
   }
   turn_ = kTurns - 1 - turn_;
-  lay_out_cleared(static_cast<T*>(cleared_[turn_].data_ptr()), nodes);
+  Arena zero(zero_[turn_]), rest(rest_);
+  nodes_ = lay_out(slots, zero, rest);
+}
+
+template <class T, int D>
+void HeatSteps<T, D>::make_nodes(backend::Stream stream) {
+  if (!is_recorded_) make_own_nodes(stream);
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
   const int64_t used = used_slots() * kBlockNodes<D>, scalar = sizeof(T);
-  clear_memory(largest_, in_.scenes * int64_t(sizeof(double)));
+  clear_memory(nodes_.largest, in_.scenes * int64_t(sizeof(double)));
   HeatSlotsArguments<T, D> touched;
   touched.topology = s_.p2g.topology;
-  touched.slots = slots;  // an earlier activation may have used more of them
+  touched.slots = s_.activation.slots();  // an earlier activation may have used more of them
   touched.order = int(in_.lattice.order());
-  touched.sums = sums_;
-  touched.matter = static_cast<bool*>(matter_.data_ptr());
+  touched.sums = nodes_.sums;
+  touched.matter = nodes_.matter;
   backend::heat_find_slots(touched, stream);
-  for (T* const of_nodes : {exchange_, source_})
+  for (T* const of_nodes : {nodes_.exchange, nodes_.source})
     if (of_nodes) clear_memory(of_nodes, used * scalar);
-  if (surface_) clear_memory(surface_, used * kHeatChannels * scalar);
+  if (nodes_.surface) clear_memory(nodes_.surface, used * kHeatChannels * scalar);
 #endif
 }
 
-// Returns the number of scalars.
 template <class T, int D>
-int64_t HeatSteps<T, D>::lay_out_cleared(T* memory, int64_t nodes) {
-  constexpr int64_t kAligned = 64;
-  int64_t size = 0;
-  const auto take = [&](int64_t count) {
-    T* const begin = memory ? memory + size : nullptr;
-    size += count;
-    return begin;
-  };
-  const int64_t scenes = in_.scenes * int64_t(sizeof(double) / sizeof(T));
-  largest_ = reinterpret_cast<double*>(take((scenes + kAligned - 1) / kAligned * kAligned));
-  sums_ = take(nodes * kHeatChannels);
-  if (exchanges()) exchange_ = take(nodes), source_ = take(nodes);
-  if (has_terms()) surface_ = take(nodes * kHeatChannels);
-  for (T*& product : product_) product = take(nodes);
-  return size;
+HeatNodeMemory<T> HeatSteps<T, D>::lay_out(int64_t slots, Arena& zero, Arena& rest) const {
+  const int64_t nodes = slots * kBlockNodes<D>;
+  HeatNodeMemory<T> m;
+  m.largest = zero.take<double>(in_.scenes);
+  m.sums = zero.take<T>(nodes * kHeatChannels);
+  if (exchanges()) m.exchange = zero.take<T>(nodes), m.source = zero.take<T>(nodes);
+  if (has_terms()) m.surface = zero.take<T>(nodes * kHeatChannels);
+  for (T*& product : m.product) product = zero.take<T>(nodes);
+  if (MPM_BACKEND == MPM_BACKEND_IS_cpu) m.matter = zero.take<bool>(slots);
+  if (!solves_for_sums()) m.theta = rest.take<T>(nodes), m.capacity = rest.take<T>(nodes);
+  m.increment = rest.take<T>(nodes);
+  if (held_nodes() > 0) m.start = rest.take<T>(nodes), m.fixed = rest.take<bool>(nodes);
+  return m;
 }
 
 template <class T, int D>
@@ -485,11 +499,11 @@ HeatToNodesArguments<T, D> HeatSteps<T, D>::to_nodes(const Field<const T>& x, co
   a.scene_dt = s_.p2g.scene_dt;
   a.dt = in_.dt;
   a.deterministic = in_.lattice.deterministic();
-  a.conductance = field<T>(conductance_);
-  a.blend = field<T>(blend_);
-  a.number = field<T>(number_);
-  a.largest = largest_;
-  a.sums = {sums_, kHeatChannels, kHeatChannels, s_.tile_memory()};
+  a.conductance = transfer_column(kConductance);
+  a.blend = transfer_column(kBlend);
+  if (melts()) a.number = transfer_column(kNumber);
+  a.largest = nodes_.largest;
+  a.sums = {nodes_.sums, kHeatChannels, kHeatChannels, s_.tile_memory()};
   return a;
 }
 
@@ -508,7 +522,7 @@ HeatToParticlesArguments<T, D> HeatSteps<T, D>::to_particles(const HeatToNodesAr
   a.scene_dt = down.scene_dt;
   a.dt = down.dt;
   a.moment_scale = in_.lattice.inverse_inertia();
-  a.nodes = {sums_ + kHeatTheta, kHeatChannels, kHeatChannels - kHeatTheta};
+  a.nodes = {nodes_.sums + kHeatTheta, kHeatChannels, kHeatChannels - kHeatTheta};
   const Field<T> next = fields.next(elsewhere);
   a.theta = column(next, 0);
   a.gradient = column(next, gradient_);
@@ -524,13 +538,11 @@ HeatNodesArguments<T, D> HeatSteps<T, D>::nodes() const {
   a.topology = s_.p2g.topology;
   HeatMeansArguments<T, D>& means = a.means;
   means.nodes = used_slots() * kBlockNodes<D>;
-  means.sums = sums_;
-  means.theta = static_cast<T*>(theta_.data_ptr());
-  means.capacity = static_cast<T*>(capacity_.data_ptr());
-  if (held_nodes() > 0) {
-    means.start = static_cast<T*>(start_.data_ptr());
-    means.fixed = static_cast<bool*>(fixed_.data_ptr());
-  }
+  means.sums = nodes_.sums;
+  means.theta = nodes_.theta;
+  means.capacity = nodes_.capacity;
+  means.start = nodes_.start;
+  means.fixed = nodes_.fixed;
   means.cleared = next_cleared();
   if (holds_surface()) a.surface = from_surface();
   for (const HeatTermArguments<T, D>& term : terms()) {
@@ -541,12 +553,12 @@ HeatNodesArguments<T, D> HeatSteps<T, D>::nodes() const {
   return a;
 }
 
-// The memory of the next substep.
+// The memory of the next substep; that of a record is zero already.
 template <class T, int D>
 HeatCleared<T> HeatSteps<T, D>::next_cleared() const {
-  if (MPM_BACKEND == MPM_BACKEND_IS_cpu) return {};
-  const Tensor& next = cleared_[kTurns - 1 - turn_];
-  return {static_cast<T*>(next.data_ptr()), next.numel()};
+  if (MPM_BACKEND == MPM_BACKEND_IS_cpu || is_recorded_) return {};
+  const Tensor& next = zero_[kTurns - 1 - turn_];
+  return {static_cast<T*>(next.data_ptr()), next.numel() / int64_t(sizeof(T))};
 }
 
 template <class T, int D>
@@ -577,7 +589,7 @@ HeatSurfaceArguments<T, D> HeatSteps<T, D>::surface(const Field<const T>& x, con
     a.dt = in_.dt;
   }
   a.deterministic = in_.lattice.deterministic();
-  a.sums = {surface_, kHeatChannels, kHeatChannels, s_.tile_memory()};
+  a.sums = {nodes_.surface, kHeatChannels, kHeatChannels, s_.tile_memory()};
   return a;
 }
 
@@ -586,11 +598,11 @@ std::vector<HeatTermArguments<T, D>> HeatSteps<T, D>::terms() const {
   std::vector<HeatTermArguments<T, D>> list;
   HeatTermArguments<T, D> a;
   a.topology = s_.p2g.topology;
-  a.sums = surface_;
-  a.theta = field<const T>(theta_).pointer;
+  a.sums = nodes_.surface;
+  a.theta = nodes_.theta;
   a.reference = in_.heat_scalars[1];
-  a.exchange = exchange_;
-  a.source = source_;
+  a.exchange = nodes_.exchange;
+  a.source = nodes_.source;
   for (size_t k = 0; k < in_.heat_terms.size(); k++) {
     a.term = HeatTerm(in_.heat_terms[k]);
     a.number = static_cast<const T*>(in_.heat_boundaries[kNumbers].data_ptr()) + 2 * int64_t(k) * in_.scenes;
@@ -603,36 +615,32 @@ std::vector<HeatTermArguments<T, D>> HeatSteps<T, D>::terms() const {
 
 // The equations of the temperatures of the nodes.
 template <class T, int D>
-HeatArguments<T, D> HeatSteps<T, D>::equations(const Field<const T>& x, backend::Stream stream) {
+HeatArguments<T, D> HeatSteps<T, D>::equations(const Field<const T>& x) const {
   HeatArguments<T, D> a;
   a.topology = s_.p2g.topology;
-  if (matter_.defined()) a.matter = static_cast<const bool*>(matter_.data_ptr());
+  a.matter = nodes_.matter;
   a.near_blocks = int(MPM_BACKEND == MPM_BACKEND_IS_cpu ? used_slots() : s_.activation.max_blocks);
   a.x = x;
-  a.conductance = field<const T>(conductance_);
-  if (solves_for_sums()) {
-    a.sums = sums_;
-  } else {
-    a.heat_capacity = field<const T>(capacity_).pointer;
-    a.theta = field<const T>(theta_).pointer;
-  }
+  a.conductance = constant(transfer_column(kConductance));
+  if (solves_for_sums()) a.sums = nodes_.sums;
+  a.heat_capacity = nodes_.capacity;
+  a.theta = held_nodes() > 0 ? nodes_.start : nodes_.theta;
+  a.fixed = nodes_.fixed;
   a.dt = in_.dt;
   a.scene_dt = s_.p2g.scene_dt.pointer;
   a.tolerance = kNegligibleResidual;
   a.relative_tolerance = in_.heat_scalars[0];
   a.most = int(in_.heat_options[1]);
   // With W = M/dt, u · H u ≤ Σ K_i u_i² and K_i = D⁻¹ Σ_p κ_p V_p N_i ≤ D⁻¹ dx² max_p r_p W_i (csrc/heat/cell.h).
-  a.scene_bound = largest_;
+  a.scene_bound = nodes_.largest;
   a.bound_scale = in_.lattice.inverse_inertia() * in_.lattice.dx() * in_.lattice.dx();
   a.deterministic = in_.lattice.deterministic();
-  if (held_nodes() > 0) hold_nodes(a, stream);
-  a.exchange = exchange_;
-  a.source = source_;
-  a.increment = static_cast<T*>(increment_.data_ptr());
+  a.exchange = nodes_.exchange;
+  a.source = nodes_.source;
+  a.increment = nodes_.increment;
   a.iterations = static_cast<int*>(iterations_.data_ptr());
   a.residual = static_cast<T*>(residual_.data_ptr());
   a.converged = static_cast<bool*>(converged_.data_ptr());
-  a.workspace = workspace(stream);
   return a;
 }
 
@@ -646,25 +654,18 @@ void* HeatSteps<T, D>::workspace(backend::Stream stream) {
   return workspace_.data_ptr();
 }
 
-// Uses the increments of a solve.
-template <class T, int D>
-void HeatSteps<T, D>::use_increments(const HeatArguments<T, D>& a, const T* increments, backend::Stream stream) {
-  backend::heat_increments(HeatIncrementsArguments<T, D>{used_slots() * kBlockNodes<D>, increments, a.theta,
-                                                         field<const T>(theta_).pointer, sums_},
-                           stream);
-}
-
 // Solves the equations of all scenes, and adds the solves to the status. The kernels of simple steps allow particles
 // that have left their base blocks, but for sums with an order, where none has. On CUDA the solver of the other scenes
 // does not, so an activation is requested where a scene may soon be one.
 template <class T, int D>
 void HeatSteps<T, D>::solve(HeatArguments<T, D>& a, backend::Stream stream) {
+  a.workspace = workspace(stream);
   HeatFinishArguments<T, D> finish;
   finish.simple.solve = a;
   finish.simple.packed = s_.with_heat.workspace != nullptr;
-  std::copy(std::begin(product_), std::end(product_), finish.simple.product);
-  finish.theta = averages();
-  finish.sums = sums_;
+  std::copy(std::begin(nodes_.product), std::end(nodes_.product), finish.simple.product);
+  finish.theta = nodes_.theta;
+  finish.sums = nodes_.sums;
   if (for_record_) finish.increment = a.increment;
   if (solves_for_sums()) finish.cleared = next_cleared();
   finish.status = rows_of_status();

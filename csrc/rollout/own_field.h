@@ -33,6 +33,14 @@ class OwnField {
     }
     return field<E>(to);
   }
+  // Reads and writes other tensors of the same shape.
+  void use(const Tensor& now, const Tensor& next) {
+    buffers_[0] = now;
+    buffers_[1] = next;
+    turn_ = 0;
+    owned_ = true;
+    now_ = field<const E>(now);
+  }
   void go(bool elsewhere) {
     turn_ = other(elsewhere);
     owned_ = true;

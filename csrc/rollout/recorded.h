@@ -1,47 +1,14 @@
 #pragma once
 
 #include "common/signals.h"
+#include "rollout/arena.h"
 #include "rollout/heat_steps.h"
 #include "rollout/step_kernels.h"
 #include "rollout/thermal_laws.op.h"
 
 // n steps with a record of the inputs of their adjoints: the particles of each step with their heat, and its active
-// blocks and nodes if these need less memory than the particles.
+// blocks and nodes if these need less memory than the particles. Heat reads and writes the record in place.
 namespace mpm {
-
-// Consecutive pieces of one tensor of bytes; without a tensor the bytes are only counted.
-class Arena {
- public:
-  Arena() = default;
-  explicit Arena(const Tensor& memory) : start_(static_cast<char*>(memory.data_ptr())) {}
-
-  template <class T>
-  T* take(int64_t count) {
-    char* const p = start_ ? start_ + size_ : nullptr;
-    size_ += (count * int64_t(sizeof(T)) + kAlignment - 1) / kAlignment * kAlignment;
-    return reinterpret_cast<T*>(p);
-  }
-
-  // A contiguous tensor, which must not outlive the memory; undefined while bytes are counted.
-  template <class T>
-  Tensor tensor(const Tensor& like, const Shape& shape, ScalarType type) {
-    int64_t count = 1;
-    for (int64_t size : shape) count *= size;
-    T* const data = take<T>(count);
-    if (!data) return {};
-    Shape strides(shape.size(), 1);
-    for (size_t i = shape.size(); i-- > 1;) strides[i - 1] = strides[i] * shape[i];
-    return torch::stable::from_blob(data, shape, strides, like.device(), type);
-  }
-
-  void skip(int64_t bytes) { size_ += bytes; }
-  int64_t size() const { return size_; }
-
- private:
-  static constexpr int64_t kAlignment = 256;
-  char* start_ = nullptr;
-  int64_t size_ = 0;
-};
 
 // A field of the particles at many steps, as consecutive structures of arrays.
 template <class T>
@@ -89,11 +56,11 @@ class Recorded {
   std::optional<HeatSteps<T, D>> heat;
   std::optional<ThermalLaws<T, D>> thermal;
   Record<T> x, v, C, F, J, residual, history, stress;
-  Record<T> mapped;      // F after the return maps
-  Record<T> mapped_J;    // J after laws that melt
-  Record<T> difference;  // of the stresses of the phases of laws that melt
-  Record<T> heat_after;  // temperature, gradient and liquid fraction
-  Record<T> dissipated;  // energy that laws have turned into heat
+  Record<T> mapped;       // F after the return maps
+  Record<T> mapped_J;     // J after laws that melt
+  Record<T> difference;   // of the stresses of the phases of laws that melt
+  Record<T> heat_before;  // fields of HeatSteps before each step and after the last one
+  Record<T> transfer;     // what the transfer of heat to the nodes stores at the particles
 
   // In `memory`, filled by an earlier `run`, or in new memory.
   Recorded(const SubstepsInputs& in, const OptionalTensor& memory, backend::Stream stream);
@@ -110,19 +77,11 @@ class Recorded {
   // Sets the inputs and the results of the laws of temperature of that step.
   void use_thermal_laws(int64_t i) { thermal->read(mapped[i], mapped_J[i], difference[i]); }
 
-  // Computes the node temperatures of that step again.
+  // The node temperatures of that step, which are computed once more where the record does not have them.
   HeatSolution<T, D> conduct_again(int64_t i) {
-    Tensor before = heat->state();
-    torch::stable::copy_(before, i == 0 ? first_heat_ : heat_after.vector(i - 1));
-    heat->begin(state(i).F, state(i).J, steps.p2g.volume, stream_);
-    if (heat->heats_by_laws()) {
-      Tensor energy = heat->dissipated_energy();
-      torch::stable::copy_(energy, dissipated.vector(i));
-    }
-    const T* const known =
-        keeps_grids_ ? static_cast<const T*>(torch::stable::select(increments_, 0, i).data_ptr()) : nullptr;
-    return heat->conduct(state(i).x, steps.p2g.mass, steps.p2g.volume, constant(C[i]), scene_of_particles(), stream_,
-                         known);
+    const Field<const T> affine = constant(C[i]);
+    if (keeps_grids_) return heat->solution(state(i).x, steps.p2g.mass, affine);
+    return heat->conduct(state(i).x, steps.p2g.mass, steps.p2g.volume, affine, scene_of_particles(), stream_);
   }
 
   // The whole record in one tensor; undefined if a pool has outgrown it.
@@ -177,6 +136,17 @@ class Recorded {
     if (steps.melts) steps.advance.J = constant(mapped_J[i]);
     for (LawUpdateArguments<T, D>& law : steps.laws) law.stress = stress[i];
     steps.p2g.stress = constant(stress[i]);
+    if (heat) read_heat(i);
+  }
+
+  // Sets the memory of the heat of step i.
+  void read_heat(int64_t i) {
+    heat->use_fields(heat_before.vector(i), heat_before.vector(i + 1));
+    if (!keeps_grids_) return heat->use_own_memory();
+    Arena zero = zero_, rest = rest_;
+    zero.skip(i * zero_size_);
+    rest.skip(i * rest_size_);
+    heat->use_memory(heat->lay_out(steps.activation.slots(), zero, rest), transfer.vector(i));
   }
 
   // Sets the time of obstacles. On CUDA the statuses count the steps.
@@ -194,16 +164,13 @@ class Recorded {
   }
 
   void conduct_heat(int64_t i) {
-    if (heat->heats_by_laws()) {
-      Tensor energy = dissipated.vector(i);
-      torch::stable::copy_(energy, heat->dissipated_energy());
-    }
     heat->run(state(i).x, steps.p2g.mass, steps.p2g.volume, constant(C[i]), scene_of_particles(), stream_);
-    Tensor to = heat_after.vector(i);
-    torch::stable::copy_(to, heat->state());
-    if (!keeps_grids_) return;
-    Tensor increments = torch::stable::select(increments_, 0, i);
-    torch::stable::copy_(increments, heat->increments());
+  }
+
+  // Lets all steps share the pool, which has outgrown the record in the activation of step i.
+  void leave_grids(int64_t i) {
+    keeps_grids_ = steps.nodes_are_clear = false;
+    if (heat) read_heat(i);
   }
 
   bool activate(int64_t i) { return steps.activate(i == 0 && !goes_on_ ? nullptr : status(i - 1), status(i), stream_); }
@@ -239,15 +206,15 @@ class Recorded {
 
   const SubstepsInputs& in_;
   backend::Stream stream_;
-  Tensor first_history_, first_heat_, memory_, workspace_, scene_times_;
+  Tensor first_history_, memory_, workspace_, scene_times_;
   Particles<const T> first_;
   std::vector<double> time_;
   const ObstacleRow<T, D>* first_row_;
   bool goes_on_;  // from a previous status
   bool keeps_grids_ = false, taken_ = false;
-  Arena grids_;  // begins at the first step
-  int64_t grid_size_ = 0;
-  Tensor nodes_, increments_;  // of all grids; the latter of heat
+  Arena grids_, zero_, rest_;  // begin at the first step; the latter two for HeatSteps::lay_out
+  int64_t grid_size_ = 0, zero_size_ = 0, rest_size_ = 0;
+  Tensor nodes_, zero_of_heat_;  // of all grids
   int* status_ = nullptr;
 };
 
@@ -262,10 +229,7 @@ Recorded<T, D>::Recorded(const SubstepsInputs& in, const OptionalTensor& memory,
   while (int64_t(time_.size()) < in.n) time_.push_back(time_.back() + in.dt);
   first_history_ = packed_history(in.x, in.history, steps.columns);
   first_ = given_particles<T, D>(in, first_history_);
-  if (HeatSteps<T, D>::wanted(in)) {
-    heat.emplace(steps);
-    first_heat_ = copy_of(heat->state());
-  }
+  if (HeatSteps<T, D>::wanted(in)) heat.emplace(steps);
   if (ThermalLaws<T, D>::wanted(steps)) {
     thermal.emplace(steps, heat ? &*heat : nullptr);
     thermal->separate();
@@ -278,7 +242,13 @@ Recorded<T, D>::Recorded(const SubstepsInputs& in, const OptionalTensor& memory,
   grid_in(one, {});
   grid_size_ = one.size();
   one.template tensor<T>(in.x, Pool<T, D>::nodes_shape(steps.activation), in.x.scalar_type());
-  if (heat) one.template tensor<T>(in.x, {int64_t(steps.activation.slots()) * kBlockNodes<D>}, in.x.scalar_type());
+  if (heat) {
+    Arena zero, rest;
+    heat->lay_out(steps.activation.slots(), zero, rest);
+    zero_size_ = zero.size();
+    rest_size_ = rest.size();
+    one.skip(zero_size_ + rest_size_);
+  }
   // At most half of the memory of the particles; torch_mpm/rollouts/budget.py relies on it.
   keeps_grids_ = 2 * one.size() <= in.x.size(0) * (2 * D + 4 * D * D) * int64_t(sizeof(T));
   lay_out(counted);
@@ -301,6 +271,10 @@ Recorded<T, D>::Recorded(const SubstepsInputs& in, const OptionalTensor& memory,
     else
       torch::stable::zero_(before);
     if (has(in.material)) stress.clear();  // of particles without a law
+    if (heat) {
+      Tensor first = heat_before.vector(0);
+      torch::stable::copy_(first, heat->fields.tensor());
+    }
   }
   steps.count_time(status(-1), stream_);
   if (has(in.scene_time)) make_scene_times();
@@ -322,13 +296,18 @@ void Recorded<T, D>::lay_out(Arena& arena) {
   if (steps.plastic) mapped = Record<T>(arena, given, n, D, D);
   if (steps.melts) mapped_J = Record<T>(arena, given, n);
   if (steps.melts) difference = Record<T>(arena, given, n, D, D);
-  if (heat) heat_after = Record<T>(arena, given, n, heat->state_columns());
-  if (heat && heat->heats_by_laws()) dissipated = Record<T>(arena, given, n);
+  if (heat) heat_before = Record<T>(arena, given, n + 1, heat->columns_of_fields());
   status_ = arena.take<int>((1 + n) * (1 + in_.scenes) * kStatusSize);
   if (!keeps_grids_) return;
   const Shape nodes = Pool<T, D>::nodes_shape(steps.activation);
   nodes_ = arena.tensor<T>(given, {n, nodes[0], nodes[1]}, given.scalar_type());
-  if (heat) increments_ = arena.tensor<T>(given, {n, nodes[0]}, given.scalar_type());
+  if (heat) {
+    transfer = Record<T>(arena, given, n, heat->transfer_columns());
+    zero_ = arena;
+    zero_of_heat_ = arena.tensor<char>(given, {n, zero_size_}, ScalarType::Byte);
+    rest_ = arena;
+    arena.skip(n * rest_size_);
+  }
   grids_ = arena;
   arena.skip(n * grid_size_);
 }
@@ -346,6 +325,7 @@ typename Recorded<T, D>::Grid Recorded<T, D>::grid_in(Arena& arena, const Tensor
 template <class T, int D>
 bool Recorded<T, D>::run() {
   if (keeps_grids_) backend::clear(nodes_, stream_);
+  if (keeps_grids_ && heat) backend::clear(zero_of_heat_, stream_);
   for (int64_t i = 0; i < in_.n; i++) {
     steps.nodes_are_clear = keeps_grids_;
     if (keeps_grids_) {
@@ -355,7 +335,7 @@ bool Recorded<T, D>::run() {
     read(i);
     set_time(i);
     if (!activate(i)) return false;
-    if (!memory().defined()) keeps_grids_ = steps.nodes_are_clear = false;  // all steps share the grown pool
+    if (keeps_grids_ && !memory().defined()) leave_grids(i);
     steps.write({x[i], v[i], C[i], F[i], J[i], residual[i], history[i]});
     if (has(in_.material) || steps.melts) keep_others(i);
     if (heat) begin_heat(i);

@@ -26,12 +26,13 @@ std::optional<Results> run_recorded(const SubstepsInputs& in, backend::Stream st
   if (!room) return {};
   const int64_t last = in.n - 1;
   const Tensor status = copy_of(r.status_tensor(last));
-  const auto copy = [&](bool wanted, const auto& record, auto view) {
-    if (!wanted) return absent();
-    const Tensor from = (record.*view)(last);
+  const auto of_particles = [&](const Tensor& from) {
     Tensor to = empty_particles(in.x, sizes_of(from));
     torch::stable::copy_(to, from);
     return to;
+  };
+  const auto copy = [&](bool wanted, const auto& record, auto view) {
+    return wanted ? of_particles((record.*view)(last)) : absent();
   };
   using R = Record<T>;
   return Results{copy(true, r.x, &R::vector),
@@ -44,7 +45,7 @@ std::optional<Results> run_recorded(const SubstepsInputs& in, backend::Stream st
                  absent(),
                  has(in.scene_time) ? r.scene_time_after() : absent(),
                  copy(has(in.residual), r.residual, &R::vector),
-                 r.heat ? r.heat->state() : absent(),
+                 r.heat ? of_particles(r.heat->state()) : absent(),
                  r.heat ? r.heat->status : absent(),
                  r.memory()};
 }

@@ -94,7 +94,7 @@ template <int Order_, class T_, int D_, int K_, bool Gradient>
 struct FieldPositionGradient {
   using T = T_;
   static constexpr int Order = Order_, D = D_, K = K_;
-  static constexpr int resident = Gradient ? 3 : 5;
+  static constexpr int resident = Gradient ? 3 : K > 3 ? 4 : 5;
   using Shape = SumShape<Order, T, D, K, K, false, false, SlopeForm::affine>;
   struct Loaded {
     T value[K], moment[K][D], gradient[K][D];  // moments and gradients per cell
@@ -152,6 +152,9 @@ struct FieldPositionGradient {
 
 template <int Order, class T, int D>
 void position_gradient(const PositionGradientArguments<T, D>& a, Stream stream) {
+  constexpr int quad = 4;  // channels that are loaded at once
+  if (a.nodes.channels == quad && !a.gradient.pointer && is_vector<quad>(a.nodes))
+    return launch_gather_of_vectors(FieldPositionGradient<Order, T, D, quad, false>(a, 0), stream);
   for_channels<D>(a.nodes.channels, a.gradient.pointer, [&]<int K, bool Gradient>(int first) {
     launch_gather(FieldPositionGradient<Order, T, D, K, Gradient>(a, first), stream);
   });

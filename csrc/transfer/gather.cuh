@@ -530,16 +530,26 @@ void launch_gather(const Task& task, Kernel* kernel, int64_t pieces, Stream stre
 }
 
 template <class Task>
-void launch_gather(const Task& task, Stream stream) {
+int64_t gather_pieces(const Task& task) {
   const int64_t particles = task.topology.particles;
-  if (particles == 0) return;
-  const int64_t pieces = std::max(most_items(task.topology.max_blocks, particles), particles / kGatherThreads<Task::D>);
+  return std::max(most_items(task.topology.max_blocks, particles), particles / kGatherThreads<Task::D>);
+}
+
+// Of nodes that are loaded as vectors.
+template <class Task>
+void launch_gather_of_vectors(const Task& task, Stream stream) {
+  if (task.topology.particles > 0) launch_gather(task, gather_kernel<true, Task>, gather_pieces(task), stream);
+}
+
+template <class Task>
+void launch_gather(const Task& task, Stream stream) {
+  if (task.topology.particles == 0) return;
   if constexpr (Task::K == 3 || Task::K == 4) {
     bool vectors = is_vector<Task::K>(task.nodes);
     if constexpr (kOthers<Task> > 0) vectors = vectors && is_vector<kOthers<Task>>(task.others);
-    if (vectors) return launch_gather(task, gather_kernel<true, Task>, pieces, stream);
+    if (vectors) return launch_gather_of_vectors(task, stream);
   }
-  launch_gather(task, gather_kernel<false, Task>, pieces, stream);
+  launch_gather(task, gather_kernel<false, Task>, gather_pieces(task), stream);
 }
 
 }  // namespace mpm::cuda

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..boundaries import Obstacle
 from ..boundaries.damping import split_damping
-from ..heat.boundaries import Term
+from ..heat.boundaries import Fixed, FixedSurface, Term
 from ..heat.heat import GRADIENT
 from ..laws import CompiledLaw, Mixture
 from ..laws.calls import law_calls, laws_of, passive
@@ -118,8 +118,18 @@ class _Sizes:
         melts = any(len(laws) > 1 for laws in materials)
         affine = (step.stress_form == "mls" or heat is not None) and not step._keeps_C
         between_laws = plastic * self._matrix + melts * (1 + self._matrix)
-        dissipated = heat is not None and heat.plastic_heating > 0
-        return self._columns() + affine * self._matrix + self._matrix + between_laws + dissipated
+        return self._columns() + affine * self._matrix + self._matrix + between_laws + self._recorded_of_heat()
+
+    def _recorded_of_heat(self) -> int:
+        """Recorded numbers of heat per particle beside its result: present volume, dissipated energy, and
+        `HeatSteps::transfer_columns`."""
+        if self._heat is None:
+            return 0
+        melts, of_transfer = LIQUID in self._state.extra, 2
+        return 1 + (self._heat.plastic_heating > 0) + of_transfer + melts + self._holds(FixedSurface)
+
+    def _holds(self, kind: type) -> bool:
+        return self._heat is not None and any(isinstance(term, kind) for term in self._heat.boundaries.entries)
 
     # ---- nodes
 
@@ -148,8 +158,19 @@ class _Sizes:
         P, table = len(self._state), self._step.grid.block_count
         schedule = 16 + (8 + 4**self._dim // 2) * (slots + P // 128) + P
         rows = 2 + bool(self._obstacles)
-        increments = self._nodes(slots) * self._size if self._heat is not None else 0
-        return 4 * (table + 2 * slots + 1 + P + schedule) + rows * self._node_rows(slots) + increments + 9 * 256
+        of_blocks = 4 * (table + 2 * slots + 1 + P + schedule) + 9 * 256
+        return of_blocks + rows * self._node_rows(slots) + self._heat_grid_bytes(slots)
+
+    def _heat_grid_bytes(self, slots: int) -> int:
+        """Nodes of a step of heat, `HeatSteps::lay_out` [bytes]."""
+        if self._heat is None:
+            return 0
+        surface, entries = self._holds(FixedSurface), self._heat.boundaries.entries
+        terms = self._heat.plastic_heating > 0 or any(not isinstance(term, (Fixed, FixedSurface)) for term in entries)
+        sums = 4 + 2 * (surface or terms) + 4 * terms
+        averages, increments, held = 2, 1, self._holds(Fixed)
+        numbers = sums + _SIMPLE_STEPS + averages + increments + held
+        return self._nodes(slots) * (numbers * self._size + held) + slots + 8 * self._step.grid.scenes + 12 * 256
 
     def _heat_nodes(self) -> int:
         """Numbers per node of a step of heat: averages, increments, what is held, sums, and vectors of the solve."""
