@@ -58,6 +58,10 @@ class FrontStatus:
         largest = self._of_scenes(len(numbers), numbers.device)
         torch.maximum(largest, numbers, out=largest)
 
+    def lags(self) -> Tensor | None:
+        """Whether fronts of a scene lag behind, bool [B] on the device; None before the first step."""
+        return None if self.largest is None else self.largest > LARGEST
+
     def warn(self) -> None:
         """Warn of fronts with too long steps; waits for the device.
 

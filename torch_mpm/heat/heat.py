@@ -29,7 +29,7 @@ from torch import Tensor, nn
 
 from ..boundaries import BoundaryList
 from ..boundaries.control import control_step
-from ..cuda_graphs.capture import outside_transforms, without_transforms
+from ..cuda_graphs.capture import DeviceConstantCache, outside_transforms, without_transforms
 from ..errors import check_like, check_number
 from ..geometry.vectors import determinant
 from ..grid.grid import Blocks, Grid, check_grid
@@ -151,6 +151,7 @@ class Heat(nn.Module):
         """Solves of each scene so far that missed their tolerance, int32 [B], and the largest residual [B] [K]."""
         self.residual: Tensor | None = None
         self.fronts = FrontStatus()
+        self._kept_numbers, self._kept_terms = DeviceConstantCache(), DeviceConstantCache()
 
     def __setattr__(self, name: str, value: Any) -> None:
         super().__setattr__(name, BoundaryList(value) if name == "boundaries" else value)
@@ -408,6 +409,15 @@ class Heat(nn.Module):
         if self.unsolved is None or self.residual is None:
             return {}
         return unsolved_heat(self.unsolved, self.residual, self.max_iterations)
+
+    def concerns(self) -> Tensor | None:
+        """Whether a solve of a scene missed its tolerance or a front lags behind, bool [B] on the device; None before
+        the first solve.
+        """
+        if self.unsolved is None:
+            return None
+        missed, lags = self.unsolved > 0, self.fronts.lags()
+        return missed if lags is None else missed | lags
 
     def check(self) -> None:
         """Check the solves so far; synchronises with the device.

@@ -141,14 +141,13 @@ class Melting(Material):
             law.check_parameters(particles, scenes)
 
     def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
-        fraction, part = self._fraction(state), self._consistent(state)
+        part = self._consistent(state)
         fields, solid = self.solid(part)
         _, liquid = self.liquid(part)
         changes = {**fields, "F": fields.get("F", part.F), "J": part.J}
         if "dissipated" in fields:
             changes["dissipated"] = torch.where(self._flows(state), 0, fields["dissipated"])
-        (stress,) = pointwise("melting_stress", state.x.shape[1], solid, liquid, fraction, self.coherency)
-        return changes, stress
+        return changes, self._stress_of_phases(state, solid, liquid)
 
     def out_of_plane_stress(self, state: State) -> Tensor:
         return self._mixed(state, lambda law, part: law.out_of_plane_stress(part))
@@ -185,9 +184,20 @@ class Melting(Material):
 
     def _mixed(self, state: State, function: Callable[[Material, Any], Tensor]) -> Tensor:
         """A scalar of the two laws, blended as the stress is."""
-        fraction, flows, part = self._fraction(state), self._flows(state), self._consistent(state)
-        solid, liquid = function(self.solid, part), function(self.liquid, part)
-        return torch.where(flows, liquid, (1 - fraction) * solid + torch.where(fraction > 0, fraction * liquid, 0))
+        part = self._consistent(state)
+        return self._blended(state, function(self.solid, part), function(self.liquid, part))
+
+    def _blended(self, state: State, solid: Tensor, liquid: Tensor) -> Tensor:
+        """Scalars of the two laws [P], blended as the stress is."""
+        fraction = self._fraction(state)
+        mixed = (1 - fraction) * solid + torch.where(fraction > 0, fraction * liquid, 0)
+        return torch.where(self._flows(state), liquid, mixed)
+
+    def _stress_of_phases(self, state: State, solid: Tensor, liquid: Tensor) -> Tensor:
+        """Stress of the material from those of its phases [P, D, D]."""
+        fraction = self._fraction(state)
+        (stress,) = pointwise("melting_stress", state.x.shape[1], solid, liquid, fraction, self.coherency)
+        return stress
 
     def _fraction(self, state: State) -> Tensor:
         """Liquid fraction [P]."""

@@ -117,8 +117,35 @@ def tables_of_parameters(law: CompiledLaw, x: Tensor) -> Tables | None:
     Cached while nothing has changed. Where they are differentiated, their knots are, and the values at these are
     computed again.
     """
+    found = _at_knots(law, x)
+    if found is None:
+        return None
+    return _tables_at(law, found.knots, x) if found.is_differentiated else found.tables
+
+
+def parameters_of_call(law: CompiledLaw, state: Any, x: Tensor) -> list[Tensor]:
+    """Parameters of a law in a call of the op, where tables replace those that are functions of the temperature: these
+    have any value."""
+    found = None if law.rate_dependent else _at_knots(law, x)
+    if found is None or found.is_differentiated or not found.tables:
+        return law._arguments(state)[1]
+    return found.parameters
+
+
+class _AtKnots(NamedTuple):
+    """What is computed of a law at the knots of its functions of the temperature."""
+
+    knots: Tensor
+    """Of all functions [K], float64."""
+    tables: Tables
+    parameters: list[Tensor]
+    """All parameters in the dtype of the particles; those that have tables at the first knot [1]."""
+    is_differentiated: bool = False
+
+
+def _at_knots(law: CompiledLaw, x: Tensor) -> _AtKnots | None:
     if not law.has_functions:
-        return []
+        return _AtKnots(x.new_empty(0), [], [])
     given = [value for name, value in law._stored().items() if law._range(name) is not None]
     functions = [value for value in given if callable(value) and not isinstance(value, Tensor)]
     others = [value for value in given if isinstance(value, Tensor)]
@@ -127,15 +154,12 @@ def tables_of_parameters(law: CompiledLaw, x: Tensor) -> Tables | None:
     numbers = [value for value in given if isinstance(value, (float, int))]
     tensors = [*others, *(tensor for f in functions for tensor in (f.temperature, f.value))]
     found = _kept(law._kept_tables, [*numbers, *tensors], lambda: _tables_of_functions(law, functions, x), x)
-    if found is None:
-        return None
-    knots, tables = found
-    return _tables_at(law, knots, x) if _is_differentiated(tensors) else tables
+    return None if found is None else found._replace(is_differentiated=_is_differentiated(tensors))
 
 
-def _tables_of_functions(law: CompiledLaw, functions: list[Table], x: Tensor) -> tuple[Tensor, Tables] | None:
-    """Knots of all functions [K] in float64, and tables of the parameters that are computed from these; None where one
-    is not linear between the knots. Waits for the device."""
+def _tables_of_functions(law: CompiledLaw, functions: list[Table], x: Tensor) -> _AtKnots | None:
+    """Tables of the parameters that are computed from functions; None where one is not linear between the knots. Waits
+    for the device."""
     knots = torch.cat([f.temperature.to(x.device, torch.float64) for f in functions]).unique()
     middles = (knots[1:] + knots[:-1]) / 2
     for _, values in _parameters_at(law, torch.cat([knots, middles]), x):
@@ -143,7 +167,8 @@ def _tables_of_functions(law: CompiledLaw, functions: list[Table], x: Tensor) ->
         error = (between - (at_knots[1:] + at_knots[:-1]) / 2).abs().max()
         if not bool(error <= 1e-12 * values.abs().max()):
             return None
-    return knots, _tables_at(law, knots, x)
+    first = [values.to(x) for values in law._arguments(_rows_at(knots[:1], x))[1]]
+    return _AtKnots(knots, _tables_at(law, knots, x), first)
 
 
 def _tables_at(law: CompiledLaw, knots: Tensor, x: Tensor) -> Tables:
@@ -153,12 +178,17 @@ def _tables_at(law: CompiledLaw, knots: Tensor, x: Tensor) -> Tables:
 
 def _parameters_at(law: CompiledLaw, temperature: Tensor, x: Tensor) -> list[tuple[int, Tensor]]:
     """Numbers of the parameters that depend on the temperature, with their values at temperatures [K]."""
+    found = enumerate(law._arguments(_rows_at(temperature, x))[1])
+    return [(number, values) for number, values in found if values.dim() > 0]
+
+
+def _rows_at(temperature: Tensor, x: Tensor) -> Any:
+    """Particles at temperatures [K]."""
     count, dim = len(temperature), x.shape[1]
-    rows: Any = Overlay(
+    return Overlay(
         None, temperature=temperature, x=temperature.new_zeros(count, dim), F=temperature.new_zeros(count, dim, dim),
         J=temperature, ids=None, scene=None, scenes=1, dt=0.0,
     )  # fmt: skip
-    return [(number, values) for number, values in enumerate(law._arguments(rows)[1]) if values.dim() > 0]
 
 
 @torch.no_grad()

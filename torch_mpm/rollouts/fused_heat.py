@@ -91,17 +91,27 @@ def _terms(heat: Heat, state: State) -> tuple[list[int], Tensor, Tensor]:
     """Terms of the free surface and their numbers [K, B, 2], and the power of the source; empty where absent."""
     terms, like, scenes = heat.boundaries.entries, state.mass, heat.grid.scenes
     kinds = list(NUMBERS)
-    rows = []
     surfaces = [term for term in terms if type(term) in NUMBERS]
-    for term in surfaces:
-        values = [_of_scenes(getattr(term, name), like, scenes) for name in _names(term)]
-        if type(term) is Radiation:
-            values[0] = STEFAN_BOLTZMANN * values[0]
-        rows.append(torch.stack([values[0], values[-1]], 1))
+    given = [(kinds.index(type(term)), *(getattr(term, name) for name in _names(term))) for term in surfaces]
+    if any([isinstance(value, Tensor) for row in given for value in row]):
+        numbers = _numbers_of(given, like, scenes)
+    else:
+        key = like.dtype, like.device, scenes, given
+        numbers = heat._kept_terms.get(key, lambda: _numbers_of(given, like, scenes), like)
     power = next((term.power for term in terms if type(term) is Source), None)
     of_source = like.new_empty(0) if power is None else _tensor("power", power, state, scenes)
-    numbers = torch.stack(rows).contiguous() if rows else like.new_empty(0)
-    return [kinds.index(type(term)) for term in surfaces], numbers, of_source
+    return [kind for kind, *_ in given], numbers, of_source
+
+
+def _numbers_of(terms: list[tuple[Any, ...]], like: Tensor, scenes: int) -> Tensor:
+    """Numbers of terms [K, B, 2], each given with the number of its kind."""
+    kinds, rows = list(NUMBERS), []
+    for kind, *given in terms:
+        values = [_of_scenes(value, like, scenes) for value in given]
+        if kinds[kind] is Radiation:
+            values[0] = STEFAN_BOLTZMANN * values[0]
+        rows.append(torch.stack([values[0], values[-1]], 1))
+    return torch.stack(rows).contiguous() if rows else like.new_empty(0)
 
 
 def _held(step: Step, x: Tensor) -> tuple[list[int], int, Tensor]:
@@ -157,7 +167,13 @@ def heat_arguments(step: Step, state: State) -> tuple[Any, ...]:
         return [], [], [], [], [], []
     temperature, scenes = needed_temperature(state), heat.grid.scenes
     names = ("conductivity", "specific_heat", "melting_point", "latent_heat")
-    values = [_tensor(name, v, state, scenes) for name, v in zip(names, heat.parameter_values, strict=False)]
+    given = list(zip(names, heat.parameter_values, strict=False))
+    if all([isinstance(value, (float, int)) for _, value in given]):
+        mass = state.mass
+        key = mass.dtype, mass.device, *(value for _, value in given)
+        values = heat._kept_numbers.get(key, lambda: [_like(value, mass) for _, value in given], mass)
+    else:
+        values = [_tensor(name, value, state, scenes) for name, value in given]
     melting = [state.extra[LIQUID], *values[2:]] if heat.melts else []
     gradient = [state.extra[GRADIENT]] if heat.affine else []
     numbers, surface, temperatures = _held(step, state.x)

@@ -170,6 +170,8 @@ class Moved(NamedTuple):
     state: State
     report: list[list[float]]
     status: list[list[float]]
+    concerns: bool
+    """Whether a solve of heat missed its tolerance, or a front lags behind."""
     shown: Shown | None
     """State in the form of a frame."""
 
@@ -463,7 +465,7 @@ class Simulation:
             moved = self._moved(segment, meanwhile)
             if steps > SEGMENT and not dt * max(moved.report[0], default=0.0) <= 1:
                 raise SimulationError("dt is above the limit")
-            if any(row[Status.PROBLEM_ACTIVATION] >= 0 for row in moved.status) or self.step.heat is not None:
+            if moved.concerns or any(row[Status.PROBLEM_ACTIVATION] >= 0 for row in moved.status):
                 self.step.check()
             bad = wrong(self.step, moved.state, self.scene.origin) if any(moved.report[2]) else None
             if bad is None:
@@ -492,14 +494,16 @@ class Simulation:
         results = {"report": torch.stack(self.step.stability_report(ordered, diagnostics=diagnostics))}
         if self.step.status is not None:
             results["status"] = self.step.status
+        if self.step.heat is not None and (of_scenes := self.step.heat.concerns()) is not None:
+            results["concerns"] = of_scenes
         copies, sums = self._show(ordered, diagnostics) if segment.shows else (None, {})
         meanwhile()
         found = on_host(results | sums)
-        report, status = found.pop("report"), found.pop("status", [])
+        report, status, concerns = found.pop("report"), found.pop("status", []), any(found.pop("concerns", []))
         if self._overflowed(status, room):
             self.step.reset()
             return self._moved(segment, meanwhile)
-        return Moved(ordered, report, status, None if copies is None else Shown(copies, found))
+        return Moved(ordered, report, status, concerns, None if copies is None else Shown(copies, found))
 
     def _overflowed(self, status: list[list[float]], room: int | None) -> bool:
         """Whether a pool of blocks that grows with the scene, with some margin before a segment, was too small for

@@ -46,6 +46,7 @@ from ..laws.calls import law_calls, laws_of
 from ..laws.compiled import CompiledLaw
 from ..laws.custom import as_law
 from ..laws.material import Material
+from ..laws.thermal import Melting, ThermalExpansion
 from ..ops.arguments import check_choice
 from ..ops.survey import Survey, law_figures, survey
 from ..state.state import State, check_state
@@ -178,9 +179,24 @@ def stability_report(
 
 def law_diagnostics(law: Material, state: State, with_energy: bool) -> LawDiagnostics:
     """Stress, stiffness and, with `with_energy`, energy density of a law."""
+    if type(law) is ThermalExpansion:
+        return law_diagnostics(law.law, law._elastic(state), with_energy)
+    if type(law) is Melting:
+        return _melting_diagnostics(law, state, with_energy)
     if all(isinstance(part, CompiledLaw) and part.figures_are_compiled() for part in laws_of(law)):
         calls = law_calls(law, state)
         how = ",".join(calls.names), calls.options, calls.parameters, calls.history, calls.variables
         return LawDiagnostics(*law_figures(state, *how, calls.material, with_energy))
     energy = law.energy_density(state) if with_energy else None
     return LawDiagnostics(law.stress(state), law.stiffness(state), energy)
+
+
+def _melting_diagnostics(law: Melting, state: State, with_energy: bool) -> LawDiagnostics:
+    """Values of a material that melts: F and J of its phases, and their parameters, are computed once."""
+    part = law._consistent(state)
+    solid, liquid = (law_diagnostics(phase, part, with_energy) for phase in (law.solid, law.liquid))
+    energy = None
+    if solid.energy is not None and liquid.energy is not None:
+        energy = law._blended(state, solid.energy, liquid.energy)
+    stress = law._stress_of_phases(state, solid.stress, liquid.stress)
+    return LawDiagnostics(stress, law._blended(state, solid.stiffness, liquid.stiffness), energy)
