@@ -245,6 +245,7 @@ def test_steps_that_are_too_long_for_a_front_are_reported(device):
             after = heat(batch.replace(temperature=theta), torch.tensor([1e-9, number * dx**2], device=device))
             melted = after.extra["liquid"].split(len(distance))
             assert not melted[0].any() and melted[1].any()
+            assert heat.concerns().tolist() == [False, warned]
             with warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always")
                 checked.check()
@@ -253,6 +254,7 @@ def test_steps_that_are_too_long_for_a_front_are_reported(device):
             if warned:
                 assert "first in scene 1, lag behind by up to 1.5 dx" in found[0] and "of 9;" in found[0]
     heat.forget(torch.tensor([False, True], device=device))
+    assert not heat.concerns().any()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         heat.check()

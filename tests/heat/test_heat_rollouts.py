@@ -298,8 +298,10 @@ def test_unsolved_heat_is_reported(device):
     for run in (mpm.rollout, composed):
         step, state = scene(2, device=device)
         step.heat.max_iterations, step.heat.conductivity = 1, 2e6
+        assert step.heat.concerns() is None
         with torch.no_grad():
             run(step, state, 3, DT)
+        assert step.heat.concerns().all()
         with pytest.raises(mpm.SimulationError) as error:
             step.check()
         messages.append(str(error.value))

@@ -55,6 +55,23 @@ def test_tables_of_another_dtype():
         assert torch.equal(a.float(), b) and b.dtype == torch.float32
 
 
+@pytest.mark.parametrize("material", ["melts", "expands", "both"])
+def test_diagnostics_are_those_of_the_law(material, device):
+    """The values of a step, whose parts are computed once for all of them, and those of the methods of the law, which
+    are computed one by one; for solid, softened, flowing and hot particles."""
+    step, state = of_wax(device, coefficient=EXPANSION, viscosity=mpm.Table([0.0, 5.0], [10.0, 1.0]))
+    law = {"melts": step.law.law, "expands": mpm.ThermalExpansion(step.law.law.solid, EXPANSION), "both": step.law}
+    step.law = law[material]
+    generator = torch.Generator(device).manual_seed(0)
+    spread = torch.rand(len(state), generator=generator, dtype=torch.float64, device=device)
+    state = step.prepare(state).replace(temperature=8 * spread - 1, J=1 + 0.1 * spread)
+    state.extra["liquid"] = (2 * spread - 0.5).clamp(0, 1)
+    found = step.diagnostics(state)
+    values = step.law.stress(state), step.law.stiffness(state), step.law.energy_density(state)
+    for value, expected in zip(found, values, strict=True):
+        torch.testing.assert_close(value, expected, rtol=1e-12, atol=0)
+
+
 @pytest.mark.parametrize("trained", ["expansion", "table of the expansion", "modulus", "viscosity"])
 def test_gradients_reach_the_values_after_calls_without(trained, device):
     """A table that was kept without gradients does not stand in their way, nor does a previous call with them."""

@@ -11,7 +11,9 @@ from helpers import disc
 pytest.importorskip("pydantic")
 pytest.importorskip("h5py")
 
+import torch_mpm as mpm
 from torch_mpm import Trajectory
+from torch_mpm.scene.diagnose import SceneFailure
 from torch_mpm.scene import Scene
 from torch_mpm.scene.explain import SceneError
 from torch_mpm.scene.run import Interrupted
@@ -119,6 +121,29 @@ def test_heated_bar_has_the_temperature_of_the_exact_solution(tmp_path):
     a = (np.arange(50) + 0.5) * math.pi
     exact = 400 - 100 * (2 / a * np.exp(-(a**2) * 0.02 * 5) * np.sin(a * x)).sum(1)
     np.testing.assert_allclose(theta, exact, atol=0.25)
+
+
+@pytest.mark.parametrize("fault", ["unsolved", "lagging"])
+def test_faults_of_heat_are_reported(tmp_path, fault, monkeypatch):
+    """In the segment in which they occur."""
+    built = Scene.build
+
+    def with_fault(scene, device=None):
+        result = built(scene, device)
+        result.step.heat.conductivity = 1e7
+        if fault == "unsolved":
+            result.step.heat.max_iterations = 1
+        return result
+
+    monkeypatch.setattr(Scene, "build", with_fault)
+    heat = {"reference": 300.0, "exchange": [{"coefficient": 1e5, "ambient": 900.0}]}
+    words = wax(duration=0.02, heat=heat, body__0__temperature=319.9)
+    if fault == "unsolved":
+        with pytest.raises(SceneFailure, match="heat"):
+            simulate(tmp_path / "out", words)
+    else:
+        with pytest.warns(mpm.FrontWarning):
+            simulate(tmp_path / "out", words)
 
 
 def test_method_of_the_solve(tmp_path):
