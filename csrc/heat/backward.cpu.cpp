@@ -34,8 +34,17 @@ template <bool Affine, class T, int D>
 template <class T, int D>
 [[gnu::noinline]] void pull_back(const HeatToNodesBackwardArguments<T, D>& a, const Group& g, int scene,
                                  const HeatGathered<Lanes<T>, D, kHeatChannels>& gathered) {
-  const Lanes<T> dt(step_of_scene(a.forward.scene_dt, a.forward.dt, scene));
-  heat_of_nodes_backward(a, AtGroup<T>{g}, scene, dt, gathered);
+  using P = Lanes<T>;
+  const AtGroup<T> at{g};
+  const Field<T> after = entry(a.moment, kHeatAfter), multiplier = entry(a.moment, kHeatMultiplier);
+  const HeatGradients<P, D> gradients{load_vector<D>(at, constant(after)), load_vector<D>(at, constant(multiplier))};
+  const P dt(step_of_scene(a.forward.scene_dt, a.forward.dt, scene));
+  const HeatForms<P, D> forms = heat_of_nodes_backward(a, at, scene, dt, gathered, gradients);
+  for (int k = 0; k < kHeatChannels; k++) store_scalar(at, entry(a.value, k), forms.value[k]);
+  store_vector<D>(at, entry(a.moment, kHeatTheta), forms.theta);
+  store_vector<D>(at, entry(a.moment, kHeatMean), forms.mean);
+  store_vector<D>(at, after, forms.after);
+  store_vector<D>(at, multiplier, forms.multiplier);
 }
 
 // What particles gather, with moments times a scale.

@@ -62,20 +62,112 @@ struct HeatToParticlesPullBack : HeatAdjointSums<Order, T, D, 2, 0, Affine> {
   __device__ void skip(int) const {}
 };
 
-static_assert(kHeatTheta == 2 && kHeatMean == 3);  // the channels with moments
-template <int Order, class T, int D, bool Affine>
-struct HeatToNodesPullBack : HeatAdjointSums<Order, T, D, kHeatChannels, kHeatTheta, Affine> {
-  using Base = HeatAdjointSums<Order, T, D, kHeatChannels, kHeatTheta, Affine>;
+// Adjoint of P2G with the gradients of θ + d and of λ, and the position gradient of all forms. The positions of the
+// particles are those of the activation.
+template <int Order_, class T_, int D_, bool Affine>
+struct HeatToNodesPullBack {
+  using T = T_;
+  static constexpr int Order = Order_, D = D_, K = kHeatChannels, Others = kHeatSolved;
+  static constexpr int resident = 4;
+  static constexpr int first_gradient = kHeatAfter - K;
+  static_assert(kHeatTheta == 2 && kHeatMean == 3 && first_gradient == 2 && Others == K);  // channels with moments
+  using OfSums = SumShape<Order, T, D, K, kHeatTheta, Affine, false, SlopeForm::none>;
+  using OfSolved = SumShape<Order, T, D, K, first_gradient, true, false, SlopeForm::none>;
+  using Slope = SumShape<Order, T, D, K, K, false, false, SlopeForm::affine>;
+  struct Loaded {
+    int p, scene;
+  };
+  using Result = Vector<T, D>;
+  struct Factors {
+    T value[K] = {}, moment[K][D] = {};  // per cell
+  };
+  Topology<T, D> topology;
+  NodeField<const T> nodes, others;
+  Columns<const T, D> position;
+  Columns<T, D> x_term;
+  T dx, inverse_dx;
   HeatToNodesBackwardArguments<T, D> a;
 
-  explicit HeatToNodesPullBack(const HeatToNodesBackwardArguments<T, D>& arguments)
-      : Base(arguments.forward.topology, arguments.nodes, arguments.forward.x, 1), a(arguments) {}
+  explicit HeatToNodesPullBack(const HeatToNodesBackwardArguments<T, D>& a)
+      : topology(a.forward.topology),
+        nodes(a.nodes),
+        others(a.solved),
+        position(a.forward.x),
+        x_term(a.x_term),
+        dx(topology.geometry.dx),
+        inverse_dx(topology.geometry.inverse_dx),
+        a(a) {}
 
-  __device__ void write(int p, const typename Base::Loaded& l, const typename Base::Result& s) const {
-    const T dt = step_of_scene(a.forward.scene_dt, a.forward.dt, l.scene);
-    heat_of_nodes_backward(a, One<T>{p}, l.scene, dt, this->gathered(s));
+  __device__ Loaded load(int p, int scene) const { return {p, scene}; }
+  template <class Support, class OtherSupport>
+  __device__ Result compute(const Loaded& l, const Weights<Order, T, D>& w, const Support& support,
+                            const OtherSupport& solved) const {
+    const HeatForms<T, D> forms = pull_back(l, w, support, solved);
+    Factors of_sums, of_solved;
+#pragma unroll
+    for (int k = 0; k < K; k++) of_sums.value[k] = forms.value[k];
+    const One<T> at{l.p};
+#pragma unroll
+    for (int k = 0; k < first_gradient; k++) of_solved.value[k] = load_scalar(at, constant(entry(a.value, K + k)));
+#pragma unroll
+    for (int d = 0; d < D; d++) {
+      of_sums.moment[kHeatTheta][d] = dx * forms.theta[d];
+      of_sums.moment[kHeatMean][d] = dx * forms.mean[d];
+      of_solved.moment[first_gradient][d] = dx * forms.after[d];
+      of_solved.moment[first_gradient + 1][d] = dx * forms.multiplier[d];
+    }
+    if (Affine) {
+#pragma unroll
+      for (int k = 0; k < first_gradient; k++) {
+        const Vector<T, D> moment = load_vector<D>(at, constant(entry(a.moment, K + k)));
+#pragma unroll
+        for (int d = 0; d < D; d++) of_solved.moment[k][d] = dx * moment[d];
+      }
+    }
+    return slope(w, support, of_sums) + slope(w, solved, of_solved);
   }
-  __device__ void skip(int p) const { skip_heat_of_nodes_backward(a, p); }
+  __device__ void write(int p, const Loaded&, const Result& x) const {
+#pragma unroll
+    for (int d = 0; d < D; d++) x_term.at(p, d) = x[d];
+  }
+  __device__ void skip(int p) const {
+    write(p, {}, zero_vector<T, D>());
+    skip_heat_of_nodes_backward(a, p);
+  }
+
+ private:
+  template <class Support, class OtherSupport>
+  __device__ HeatForms<T, D> pull_back(const Loaded& l, const Weights<Order, T, D>& w, const Support& support,
+                                       const OtherSupport& solved) const {
+    const Sums<OfSums> sums = sum_support<OfSums>(support, w);
+    const Sums<OfSolved> of_solved = sum_support<OfSolved>(solved, w);
+    const T scale = T(a.inverse_inertia) * dx;
+    HeatGathered<T, D, K> gathered;
+    HeatGradients<T, D> gradients;
+#pragma unroll
+    for (int k = 0; k < K; k++) {
+      gathered.value[k] = sums.value[k];
+#pragma unroll
+      for (int d = 0; d < D; d++) gathered.moment[k][d] = Affine && k >= kHeatTheta ? dx * sums.moment[k][d] : T(0);
+    }
+#pragma unroll
+    for (int d = 0; d < D; d++) {
+      gradients.after[d] = scale * of_solved.moment[first_gradient][d];
+      gradients.multiplier[d] = scale * of_solved.moment[first_gradient + 1][d];
+    }
+    const T dt = step_of_scene(a.forward.scene_dt, a.forward.dt, l.scene);
+    return heat_of_nodes_backward(a, One<T>{l.p}, l.scene, dt, gathered, gradients);
+  }
+  template <class Support>
+  __device__ Vector<T, D> slope(const Weights<Order, T, D>& w, const Support& support, const Factors& f) const {
+    const T none[K][D] = {};
+    Sums<Slope> sums;
+    position_slope<Slope, false>(support, w, f.value, f.moment, none, sums);
+    Vector<T, D> x;
+#pragma unroll
+    for (int d = 0; d < D; d++) x[d] = inverse_dx * sums.slope[d];
+    return x;
+  }
 };
 
 template <class T, int D>
@@ -160,9 +252,9 @@ void heat_surface_row_backward(const HeatSurfaceRowBackwardArguments<T, D>& a, S
 template <int Order, class T, int D>
 void heat_to_nodes_backward(const HeatToNodesBackwardArguments<T, D>& a, Stream stream) {
   if (a.gradient.pointer)
-    launch_gather(HeatToNodesPullBack<Order, T, D, true>(a), stream);
+    launch_gather_of_vectors(HeatToNodesPullBack<Order, T, D, true>(a), stream);
   else
-    launch_gather(HeatToNodesPullBack<Order, T, D, false>(a), stream);
+    launch_gather_of_vectors(HeatToNodesPullBack<Order, T, D, false>(a), stream);
 }
 
 MPM_HEAT_BACKWARD_KERNELS(MPM_INSTANTIATE, MPM_INSTANTIATE_ORDERS, MPM_INSTANTIATE_SIZE)

@@ -115,6 +115,7 @@ struct HeatToNodesBackwardArguments {
   HeatToNodesArguments<T, D> forward;
   Field<const T> rest, F, J;                 // of the present volume; the last two may be absent
   NodeField<const T> nodes;                  // adjoints of the sums, kHeatChannels
+  NodeField<const T> solved;                 // on CUDA, kHeatSolved, see HeatNodesBackwardArguments
   Field<const T> blend;                      // adjoint of β by G2P
   Field<const T> rate;                       // gathered λ d/dt², absent where the adjoint of dt is not wanted
   HeatSurfaceArguments<T, D> surface;        // of the boundary, absent without `surface_value`; its sums are unused
@@ -122,7 +123,9 @@ struct HeatToNodesBackwardArguments {
   Field<T> dissipated;                       // adjoint of the energy that laws dissipate, written; may be absent
   double inverse_inertia = 1;                // D⁻¹ [1/m²]
   Field<const T> conductance;                // adjoint of κ V, where a layer has changed it; or absent
-  Field<T> value, moment;    // forms: those of P2G are written, ∇(θ + d) and ∇λ become those of the solve
+  Field<T> value, moment;  // forms: those of G2P; on the CPU those of P2G are written, and ∇(θ + d) and ∇λ become those
+                           // of the solve
+  Field<T> x_term;         // on CUDA, position gradient of all forms, written
   Field<T> theta, gradient;  // adjoints, added, as those below
   Field<T> velocity_gradient;
   Field<T> mass, volume, parameters, dt;  // of the rest volume; may be absent

@@ -264,19 +264,27 @@ MPM_HD void heat_of_node_backward(const HeatNodesBackwardArguments<T, D>& a, int
   if (a.layer) a.layer[i] = multiplier * (a.temperature[scene * a.stride] - (theta + increment));
 }
 
-// Adjoint of κ V by λ · H (θ + d) = Σ_p κ V ∇(θ + d) · ∇λ, which the equation of the solve subtracts; the gradients in
-// the moments become the factors of the forms.
-template <class At, class T, int D>
-MPM_HD typename At::Value pull_back_conduction(const HeatToNodesBackwardArguments<T, D>& a, const At& at,
-                                               const typename At::Value& conductance) {
-  using V = typename At::Value;
-  const Field<T> after = entry(a.moment, kHeatAfter), multiplier = entry(a.moment, kHeatMultiplier);
-  const Vector<V, D> of_after = load_vector<D>(at, constant(after)),
-                     of_multiplier = load_vector<D>(at, constant(multiplier));
+// Forms of a particle in a step: the values of those of P2G, and moments of these and of those of λ · H (θ + d).
+template <class V, int D>
+struct HeatForms {
+  V value[kHeatChannels];
+  Vector<V, D> theta, mean, after, multiplier;
+};
+
+// ∇(θ + d) and ∇λ at a particle.
+template <class V, int D>
+struct HeatGradients {
+  Vector<V, D> after, multiplier;
+};
+
+// Adjoint of κ V by λ · H (θ + d) = Σ_p κ V ∇(θ + d) · ∇λ, which the equation of the solve subtracts.
+template <class V, class T, int D>
+MPM_HD V pull_back_conduction(const HeatToNodesBackwardArguments<T, D>& a, const V& conductance,
+                              const HeatGradients<V, D>& gradients, HeatForms<V, D>& forms) {
   const V scale = -(V(T(a.inverse_inertia)) * conductance);
-  store_vector<D>(at, after, scale * of_multiplier);
-  store_vector<D>(at, multiplier, scale * of_after);
-  return -dot(of_after, of_multiplier);
+  forms.after = scale * gradients.multiplier;
+  forms.multiplier = scale * gradients.after;
+  return -dot(gradients.after, gradients.multiplier);
 }
 
 constexpr int kPositionEntry = 1;  // of the first coordinate in ObstacleRow
@@ -390,12 +398,12 @@ MPM_HD typename At::Value pull_back_surface(const HeatToNodesBackwardArguments<T
   return by_volume;
 }
 
-// Adjoints of what P2G adds to the sums of the nodes: those of θ and its gradient are added, and the factors of the
-// forms stored; returns those of the heat capacity and of β.
+// Adjoints of what P2G adds to the sums of the nodes: those of θ and its gradient are added, and the forms set; returns
+// those of the heat capacity and of β.
 template <class At, class T, int D>
 MPM_HD HeatWeights<typename At::Value> pull_back_sums(
     const HeatToNodesBackwardArguments<T, D>& a, const At& at, const HeatWeights<typename At::Value>& weights,
-    const HeatGathered<typename At::Value, D, kHeatChannels>& gathered) {
+    const HeatGathered<typename At::Value, D, kHeatChannels>& gathered, HeatForms<typename At::Value, D>& forms) {
   using V = typename At::Value;
   const HeatToNodesArguments<T, D>& f = a.forward;
   const bool affine = f.particles.gradient.pointer;
@@ -407,10 +415,11 @@ MPM_HD HeatWeights<typename At::Value> pull_back_sums(
   arguments.put(load_scalar(at, f.particles.theta));
   arguments.put(slope);
   const HeatSums<V> sums = heat_sums(weights, in[2]);
-  store_scalar(at, entry(a.value, kHeatCapacity), sums.capacity);
-  store_scalar(at, entry(a.value, kHeatVarying), sums.varying);
-  store_scalar(at, entry(a.value, kHeatTheta), sums.theta);
-  store_scalar(at, entry(a.value, kHeatMean), sums.mean);
+  forms.value[kHeatCapacity] = sums.capacity;
+  forms.value[kHeatVarying] = sums.varying;
+  forms.value[kHeatTheta] = sums.theta;
+  forms.value[kHeatMean] = sums.mean;
+  forms.theta = forms.mean = zero_vector<V, D>();
   pull_back(in, grad, [&](const Dual<V>(&x)[3 + D]) {
     HeatWeights<Dual<V>> w{};
     w.capacity = x[0];
@@ -428,13 +437,11 @@ MPM_HD HeatWeights<typename At::Value> pull_back_sums(
   });
   add_scalar(at, a.theta, grad[2]);
   if (affine) {
-    Vector<V, D> of_theta, of_mean, by_slope;
+    Vector<V, D> by_slope;
     MPM_UNROLL for (int d = 0; d < D; d++) {
       const HeatSums<V> moment = heat_sums(weights, slope[d]);
-      of_theta[d] = moment.theta, of_mean[d] = moment.mean, by_slope[d] = grad[3 + d];
+      forms.theta[d] = moment.theta, forms.mean[d] = moment.mean, by_slope[d] = grad[3 + d];
     }
-    store_vector<D>(at, entry(a.moment, kHeatTheta), of_theta);
-    store_vector<D>(at, entry(a.moment, kHeatMean), of_mean);
     store_vector<D>(Adding<At>(at), a.gradient, by_slope);
   }
   HeatWeights<V> by{};
@@ -463,11 +470,12 @@ MPM_HD void pull_back_volume(const HeatToNodesBackwardArguments<T, D>& a, const 
   add_scalar(at, a.volume, ratio * by_volume);
 }
 
-// At particles inside the grid, from the adjoints of the sums.
+// At particles inside the grid, from the adjoints of the sums and the gradients; returns the forms.
 template <class At, class T, int D>
-MPM_HD void heat_of_nodes_backward(const HeatToNodesBackwardArguments<T, D>& a, const At& at, int scene,
-                                   const typename At::Value& dt,
-                                   const HeatGathered<typename At::Value, D, kHeatChannels>& gathered) {
+MPM_HD HeatForms<typename At::Value, D> heat_of_nodes_backward(
+    const HeatToNodesBackwardArguments<T, D>& a, const At& at, int scene, const typename At::Value& dt,
+    const HeatGathered<typename At::Value, D, kHeatChannels>& gathered,
+    const HeatGradients<typename At::Value, D>& gradients) {
   using V = typename At::Value;
   const HeatToNodesArguments<T, D>& f = a.forward;
   const V volume = load_scalar(at, f.particles.volume), dx(f.topology.geometry.dx);
@@ -482,9 +490,10 @@ MPM_HD void heat_of_nodes_backward(const HeatToNodesBackwardArguments<T, D>& a, 
   HeatWeights<V> weights = heat_weights(in[0], in[1], in[2], in[3], in[4], in[5], dx);
   weights.blend = blend_of(f.transfer, weights.blend);
 
-  HeatWeights<V> by = pull_back_sums(a, at, weights, gathered);
+  HeatForms<V, D> forms;
+  HeatWeights<V> by = pull_back_sums(a, at, weights, gathered, forms);
   by.blend = by.blend + load_scalar(at, a.blend);
-  const V by_rest = pull_back_conduction(a, at, load_scalar(at, constant(f.conductance)));
+  const V by_rest = pull_back_conduction(a, load_scalar(at, constant(f.conductance)), gradients, forms);
   by.conductance = a.conductance.pointer ? load_scalar(at, a.conductance) : by_rest;
   const V by_volume = a.surface_value.pointer ? pull_back_surface(a, at, scene, volume, dt) : V(0);
   if (a.rate.pointer) add_scalar(at, a.dt, weights.capacity * load_scalar(at, a.rate));
@@ -500,6 +509,7 @@ MPM_HD void heat_of_nodes_backward(const HeatToNodesBackwardArguments<T, D>& a, 
   add_scalar(at, a.mass, grad[3]);
   add_scalar(at, a.dt, grad[4]);
   if (varies) store_matrix<D>(Adding<At>(at), a.velocity_gradient, grad[5] * strain_rate_slope(L));
+  return forms;
 }
 
 // A particle outside the grid takes no part.

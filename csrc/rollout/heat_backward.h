@@ -41,10 +41,14 @@ class HeatBackward {
     gather(solution.down, adjoints.dt.defined());
     if (heat().holds_surface()) adjoint_of_layers(i, solution.down, adjoints.obstacles);
     backend::heat_to_nodes_backward(order(), to_nodes(i, solution.down, adjoints), stream_);
-    position_gradient(solution.down);
+    if (!kGathersAtOnce) position_gradient(solution.down);
+    position_gradient_of_boundaries(solution.down);
   }
 
  private:
+  // Whether the adjoint of P2G gathers ∇(θ + d) and ∇λ itself, and computes the position gradient of the forms.
+  static constexpr bool kGathersAtOnce = MPM_BACKEND == MPM_BACKEND_IS_cuda;
+
   int64_t order() const { return in_.lattice.order(); }
   T* rows(const Tensor& t) const { return static_cast<T*>(t.data_ptr()); }
   HeatSteps<T, D>& heat() const { return *record_.heat; }
@@ -72,6 +76,7 @@ class HeatBackward {
   HeatToNodesBackwardArguments<T, D> to_nodes(int64_t i, const HeatToNodesArguments<T, D>& down,
                                               const HeatAdjoints& adjoints) const;
   void position_gradient(const HeatToNodesArguments<T, D>& down);
+  void position_gradient_of_boundaries(const HeatToNodesArguments<T, D>& down);
 
   Recorded<T, D>& record_;
   const SubstepsInputs& in_;
@@ -290,11 +295,13 @@ void HeatBackward<T, D>::gather(const HeatToNodesArguments<T, D>& down, bool by_
   GatherArguments<T, D> a;
   a.topology = down.topology;
   a.x = down.x;
-  a.nodes = {rows(solved_) + (kHeatAfter - kHeatChannels), kHeatSolved, 2};
-  a.moment_scale = in_.lattice.inverse_inertia();
-  a.moment = forms(moment_, kHeatAfter);
-  backend::gather(order(), a, stream_);
-  a.moment = {};
+  if (!kGathersAtOnce || heat().holds_surface()) {
+    a.nodes = {rows(solved_) + (kHeatAfter - kHeatChannels), kHeatSolved, 2};
+    a.moment_scale = in_.lattice.inverse_inertia();
+    a.moment = forms(moment_, kHeatAfter);
+    backend::gather(order(), a, stream_);
+    a.moment = {};
+  }
   if (heat().has_terms()) {
     a.nodes = {rows(surface_), kHeatChannels, 1 + D};
     a.value = field<T>(surface_value_);
@@ -319,6 +326,8 @@ HeatToNodesBackwardArguments<T, D> HeatBackward<T, D>::to_nodes(int64_t i, const
   a.F = before.F;
   a.J = before.J;
   a.nodes = {rows(by_sums_), kHeatChannels, kHeatChannels};
+  a.solved = {rows(solved_), kHeatSolved, kHeatSolved};
+  a.x_term = field<T>(x_term);
   a.blend = field<const T>(blend_);
   if (adjoints.dt.defined()) a.rate = constant(HeatSteps<T, D>::column_of(rate_of_particles_, 0));
   a.inverse_inertia = in_.lattice.inverse_inertia();
@@ -382,7 +391,7 @@ void HeatBackward<T, D>::adjoint_of_surface(int64_t i, const HeatLayersBackwardA
                      stream_);
 }
 
-// Of all forms: those of P2G and of the solve, those of the free surface, and that of the exchange of a held surface.
+// Of the forms of P2G, and of those of G2P and of the solve.
 template <class T, int D>
 void HeatBackward<T, D>::position_gradient(const HeatToNodesArguments<T, D>& down) {
   PositionGradientArguments<T, D> a;
@@ -398,7 +407,16 @@ void HeatBackward<T, D>::position_gradient(const HeatToNodesArguments<T, D>& dow
   a.moment = constant(forms(moment_, kHeatIncrement));
   a.nodes = {rows(solved_), kHeatSolved, kHeatSolved};
   backend::position_gradient(order(), a, stream_);
-  a.moment = {};
+}
+
+// Adds that of the exchange of a held surface, and of the forms of the free surface.
+template <class T, int D>
+void HeatBackward<T, D>::position_gradient_of_boundaries(const HeatToNodesArguments<T, D>& down) {
+  PositionGradientArguments<T, D> a;
+  a.topology = down.topology;
+  a.x = down.x;
+  a.position_gradient = field<T>(x_term);
+  a.adds = true;
   if (heat().holds_surface()) {
     a.value = constant(heat().exchange_of_particles());
     a.nodes = {rows(layer_), 1, 1};

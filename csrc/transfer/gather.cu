@@ -77,24 +77,11 @@ void gather(const GatherArguments<T, D>& a, Stream stream) {
 
 // ---- Position gradient
 
-// Position gradient of Σ_i g_i · N_i (value + moment · r) + gradient · ∇N_i in cells, for a form with S::SlopeForm
-// affine.
-template <class S, bool Gradient, class Support, class T>
-__device__ void position_slope(const Support& support, const Weights<S::Order, T, S::D>& w, const T (&value)[S::K],
-                               const T (&moment)[S::K][S::D], const T (&gradient)[S::K][S::D], Sums<S>& s) {
-  sum_axis<S, 0>(support, support.rows, 0, w, value, moment, s);
-  if (Gradient) add_hessian<S>(support, w, gradient, s.slope);
-#pragma unroll
-  for (int k = 0; k < S::K; k++)
-#pragma unroll
-    for (int i = 0; i < S::D; i++) s.slope[i] -= moment[k][i] * s.value[k];
-}
-
 template <int Order_, class T_, int D_, int K_, bool Gradient>
 struct FieldPositionGradient {
   using T = T_;
   static constexpr int Order = Order_, D = D_, K = K_;
-  static constexpr int resident = Gradient ? 3 : K > 3 ? 4 : 5;
+  static constexpr int resident = Gradient ? 3 : 5;
   using Shape = SumShape<Order, T, D, K, K, false, false, SlopeForm::affine>;
   struct Loaded {
     T value[K], moment[K][D], gradient[K][D];  // moments and gradients per cell
@@ -152,9 +139,6 @@ struct FieldPositionGradient {
 
 template <int Order, class T, int D>
 void position_gradient(const PositionGradientArguments<T, D>& a, Stream stream) {
-  constexpr int quad = 4;  // channels that are loaded at once
-  if (a.nodes.channels == quad && !a.gradient.pointer && is_vector<quad>(a.nodes))
-    return launch_gather_of_vectors(FieldPositionGradient<Order, T, D, quad, false>(a, 0), stream);
   for_channels<D>(a.nodes.channels, a.gradient.pointer, [&]<int K, bool Gradient>(int first) {
     launch_gather(FieldPositionGradient<Order, T, D, K, Gradient>(a, first), stream);
   });

@@ -231,6 +231,19 @@ __device__ void add_hessian(const Support& support, const Weights<S::Order, T, S
   }
 }
 
+// Position gradient of Σ_i g_i · N_i (value + moment · r) + gradient · ∇N_i in cells, for a form with S::SlopeForm
+// affine.
+template <class S, bool Gradient, class Support, class T>
+__device__ void position_slope(const Support& support, const Weights<S::Order, T, S::D>& w, const T (&value)[S::K],
+                               const T (&moment)[S::K][S::D], const T (&gradient)[S::K][S::D], Sums<S>& s) {
+  sum_axis<S, 0>(support, support.rows, 0, w, value, moment, s);
+  if (Gradient) add_hessian<S>(support, w, gradient, s.slope);
+#pragma unroll
+  for (int k = 0; k < S::K; k++)
+#pragma unroll
+    for (int i = 0; i < S::D; i++) s.slope[i] -= moment[k][i] * s.value[k];
+}
+
 // ---- The two orders
 
 // Threads of a block. In 2-D a base block mostly has 64 particles, four a cell.
