@@ -9,7 +9,7 @@ namespace mpm {
 // Trilinear forms of particles and nodes whose position gradients belong to the step: those of P2G, in the order of
 // HeatChannel, those of G2P, and the two of λ · H (θ + d).
 enum HeatForm : int { kHeatIncrement = kHeatChannels, kHeatAverage, kHeatAfter, kHeatMultiplier, kHeatForms };
-constexpr int kHeatSolved = kHeatForms - kHeatChannels;  // forms after those of P2G
+constexpr int kHeatSolved = int(kHeatForms) - int(kHeatChannels);  // forms after those of P2G
 
 // Columns of the adjoints of the parameters.
 enum HeatParameter : int { kConductivity, kSpecificHeat, kMeltingPoint, kLatentHeat, kPower, kHeatParameters };
