@@ -68,7 +68,7 @@ template <int Order_, class T_, int D_, bool Affine>
 struct HeatToNodesPullBack {
   using T = T_;
   static constexpr int Order = Order_, D = D_, K = kHeatChannels, Others = kHeatSolved;
-  static constexpr int resident = 4;
+  static constexpr int resident = 3;
   static constexpr int first_gradient = kHeatAfter - K;
   static_assert(kHeatTheta == 2 && kHeatMean == 3 && first_gradient == 2 && Others == K);  // channels with moments
   using OfSums = SumShape<Order, T, D, K, kHeatTheta, Affine, false, SlopeForm::none>;
@@ -140,6 +140,7 @@ struct HeatToNodesPullBack {
   __device__ HeatForms<T, D> pull_back(const Loaded& l, const Weights<Order, T, D>& w, const Support& support,
                                        const OtherSupport& solved) const {
     const Sums<OfSums> sums = sum_support<OfSums>(support, w);
+    forget_nodes();
     const Sums<OfSolved> of_solved = sum_support<OfSolved>(solved, w);
     const T scale = T(a.inverse_inertia) * dx;
     HeatGathered<T, D, K> gathered;
@@ -160,6 +161,7 @@ struct HeatToNodesPullBack {
   }
   template <class Support>
   __device__ Vector<T, D> slope(const Weights<Order, T, D>& w, const Support& support, const Factors& f) const {
+    forget_nodes();
     const T none[K][D] = {};
     Sums<Slope> sums;
     position_slope<Slope, false>(support, w, f.value, f.moment, none, sums);

@@ -281,7 +281,6 @@ class HeatSteps {
 template <class T, int D>
 HeatSteps<T, D>::HeatSteps(Substeps<T, D>& steps) : s_(steps), in_(steps.in) {
   const Tensor& x = in_.x;
-  const int64_t P = x.size(0);
   const size_t tensors = in_.heat.size() - has_gradient();
   STD_TORCH_CHECK(tensors == 3 || tensors == 6, "heat must be 3 or 6 tensors, and the gradient, got ", in_.heat.size());
   STD_TORCH_CHECK(in_.heat_options.size() == 3, "heat_options must have 3 entries, got ", in_.heat_options.size());

@@ -201,7 +201,8 @@ struct Substeps {
     if (in.heat.empty())
       for (LawUpdateArguments<T, D>& law : laws) law.runs_beside = !law.adds;
     next.particles = in.x.size(0);
-    if (!in.heat.empty()) activation.out_of_block_cost = next.out_of_block_cost = kOutOfBlockCostWithHeat;
+    if (!in.heat.empty())
+      activation.out_of_block_cost = next.out_of_block_cost = out_of_block_cost_with_heat(next.particles);
     next.obstacles = obstacles && !impulse.defined();  // impulses need the velocities before contact
     const int64_t most = std::min<int64_t>(update.block_count, INT32_MAX / kBlockNodes<D> - activation.max_blocks);
     activation.margin_blocks = int(std::clamp<int64_t>(activation.max_blocks / 2 + 64, 0, std::max<int64_t>(most, 0)));

@@ -231,6 +231,10 @@ __device__ void add_hessian(const Support& support, const Weights<S::Order, T, S
   }
 }
 
+// Between two sums over a support: the second one loads the nodes once more. Otherwise the compiler would store all of
+// them in registers, which are too few.
+__device__ inline void forget_nodes() { asm volatile("" ::: "memory"); }
+
 // Position gradient of Σ_i g_i · N_i (value + moment · r) + gradient · ∇N_i in cells, for a form with S::SlopeForm
 // affine.
 template <class S, bool Gradient, class Support, class T>
