@@ -10,6 +10,7 @@ namespace mpm {
 // HeatChannel, those of G2P, and the two of λ · H (θ + d).
 enum HeatForm : int { kHeatIncrement = kHeatChannels, kHeatAverage, kHeatAfter, kHeatMultiplier, kHeatForms };
 constexpr int kHeatSolved = int(kHeatForms) - int(kHeatChannels);  // forms after those of P2G
+constexpr int kIncrementAdjoint = 0, kAverageAdjoint = 1;  // channels of the adjoints of the nodes by these forms
 
 // Columns of the adjoints of the parameters.
 enum HeatParameter : int { kConductivity, kSpecificHeat, kMeltingPoint, kLatentHeat, kPower, kHeatParameters };
@@ -74,7 +75,7 @@ struct HeatNodesBackwardArguments {
   const T* theta = nullptr;       // averages before it
   const T* multiplier = nullptr;  // λ
   const T* product = nullptr;     // H λ
-  const T* adjoints = nullptr;    // of the increment and θ̄ [N, 2]
+  const T* adjoints = nullptr;    // of the increment and θ̄ [N, kHeatSolved], of which the others are unused
   const T* exchange = nullptr;    // [N], as those below; absent without boundaries
   const T* by_terms = nullptr;    // adjoint of θ by the terms of the boundary
   const bool* fixed = nullptr;

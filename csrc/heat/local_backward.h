@@ -219,7 +219,7 @@ MPM_HD void held_temperature_of_slot(const HeatHeldBackwardArguments<T, D>& a, i
     const int64_t i = slot * kBlockNodes<D> + local;
     if (!a.hold.fixed[i] || a.counted[i] || !is_held(a.hold, pose, corner, local)) continue;
     a.counted[i] = true;
-    sum += a.adjoints[2 * i] - a.product[i];
+    sum += a.adjoints[kHeatSolved * i + kIncrementAdjoint] - a.product[i];
   }
   a.to.sums[slot * a.to.columns + a.to.first] = sum;
 }
@@ -246,8 +246,9 @@ MPM_HD void heat_of_node_backward(const HeatNodesBackwardArguments<T, D>& a, int
   T by_theta = -a.product[i];
   if (a.exchange) by_theta -= a.exchange[i] * multiplier;
   if (a.by_terms) by_theta += a.by_terms[i];
-  if (a.fixed && a.fixed[i]) by_theta = -a.adjoints[2 * i];  // the increment leads to the held temperature
-  const T adjoint[] = {-rate, T(0), by_theta, a.adjoints[2 * i + 1]};
+  const T* const adjoints = a.adjoints + kHeatSolved * i;
+  if (a.fixed && a.fixed[i]) by_theta = -adjoints[kIncrementAdjoint];  // the increment leads to the held temperature
+  const T adjoint[] = {-rate, T(0), by_theta, adjoints[kAverageAdjoint]};
   T grad[Means::kIn];
   Means::pull_back(in, adjoint, [](int) { return true; }, [&](int n, const T& value) { grad[n] = value; });
   T* const by_sums = a.by_sums + i * kHeatChannels;

@@ -34,12 +34,13 @@ struct HeatArguments {
   const T* heat_capacity = nullptr;  // [N], as those below
   const T* theta = nullptr;          // absent: zero
   const T* sums = nullptr;           // on CUDA, in place of these two: [N, kHeatChannels] before any change
-  const T* source = nullptr;         // absent: zero
-  const T* exchange = nullptr;       // absent: zero
-  const bool* fixed = nullptr;       // absent: none
-  double dt = 0;                     // times scene_dt where given
-  const T* scene_dt = nullptr;       // [scenes]
-  double tolerance = 0;              // replaced by scene_tolerance where given
+  const T* source = nullptr;         // of node i at source + i * source_stride, which is 1 on the CPU; absent: zero
+  int source_stride = 1;
+  const T* exchange = nullptr;         // absent: zero
+  const bool* fixed = nullptr;         // absent: none
+  double dt = 0;                       // times scene_dt where given
+  const T* scene_dt = nullptr;         // [scenes]
+  double tolerance = 0;                // replaced by scene_tolerance where given
   const T* scene_tolerance = nullptr;  // [scenes]
   double relative_tolerance = 0;       // of the first residual
   int most = 0;                        // maximum number of iterations, replaced by scene_most where given
@@ -234,7 +235,8 @@ template <class T, int D>
 MPM_HD NodeEquation<T> node_equation(const HeatArguments<T, D>& a, int64_t row, const T& product, double dt) {
   const T mass = capacity_at(a, row), exchange = a.exchange ? a.exchange[row] : T(0);
   const bool material = !(mass <= T(0)), held = material && a.fixed && a.fixed[row], free = material && !held;
-  NodeEquation<T> e{free, held || (free && exchange != T(0)), mass, a.source ? a.source[row] : T(0), T(0), T(0)};
+  NodeEquation<T> e{free, held || (free && exchange != T(0)), mass, T(0), T(0), T(0)};
+  if (a.source) e.source = a.source[row * a.source_stride];
   if (!free) return e;
   e.weight = mass / T(dt) + exchange;
   e.residual = e.source - product;

@@ -41,13 +41,13 @@ class HeatBackward {
     gather(solution.down, adjoints.dt.defined());
     if (heat().holds_surface()) adjoint_of_layers(i, solution.down, adjoints.obstacles);
     backend::heat_to_nodes_backward(order(), to_nodes(i, solution.down, adjoints), stream_);
-    if (!kGathersAtOnce) position_gradient(solution.down);
+    if (!kOnCuda) position_gradient(solution.down);
     position_gradient_of_boundaries(solution.down);
   }
 
  private:
-  // Whether the adjoint of P2G gathers ∇(θ + d) and ∇λ itself, and computes the position gradient of the forms.
-  static constexpr bool kGathersAtOnce = MPM_BACKEND == MPM_BACKEND_IS_cuda;
+  // There the adjoint of P2G gathers ∇(θ + d) and ∇λ itself, and computes the position gradient of the forms.
+  static constexpr bool kOnCuda = MPM_BACKEND == MPM_BACKEND_IS_cuda;
 
   int64_t order() const { return in_.lattice.order(); }
   T* rows(const Tensor& t) const { return static_cast<T*>(t.data_ptr()); }
@@ -124,11 +124,12 @@ void HeatBackward<T, D>::make_nodes(const HeatSolution<T, D>& solution) {
   const int64_t nodes = int64_t(solution.system.topology.max_blocks) * kBlockNodes<D>;
   if (nodes == nodes_) return;
   nodes_ = nodes;
-  zero_ = empty(in_.x, {2 + 1 + kMostSimpleSteps, nodes});
-  adjoints_ = torch::stable::view(torch::stable::narrow(zero_, 0, 0, 2), {nodes, 2});
-  product_ = torch::stable::narrow(zero_, 0, 2, 1);
-  products_ = torch::stable::narrow(zero_, 0, 3, kMostSimpleSteps);
-  for (Tensor* t : {&source_, &multiplier_, &rate_}) *t = empty(in_.x, {nodes});
+  zero_ = empty(in_.x, {kHeatSolved + 1 + kMostSimpleSteps, nodes});
+  adjoints_ = torch::stable::view(torch::stable::narrow(zero_, 0, 0, kHeatSolved), {nodes, int64_t(kHeatSolved)});
+  product_ = torch::stable::narrow(zero_, 0, kHeatSolved, 1);
+  products_ = torch::stable::narrow(zero_, 0, kHeatSolved + 1, kMostSimpleSteps);
+  for (Tensor* t : {&multiplier_, &rate_}) *t = empty(in_.x, {nodes});
+  if (!kOnCuda) source_ = empty(in_.x, {nodes});
   by_sums_ = empty(in_.x, {nodes, kHeatChannels});
   solved_ = empty(in_.x, {nodes, kHeatSolved});
   if (heat().holds_surface()) layer_ = empty(in_.x, {nodes});
@@ -153,7 +154,8 @@ HeatToParticlesBackwardArguments<T, D> HeatBackward<T, D>::to_particles(const He
   return a;
 }
 
-// Adjoints of the increments and of θ̄.
+// Adjoints of the increments and of θ̄. On CUDA four channels are one pass, two of them unused, and the solve reads the
+// adjoints in place.
 template <class T, int D>
 void HeatBackward<T, D>::scatter(const HeatToParticlesBackwardArguments<T, D>& up) {
   ScatterArguments<T, D> a;
@@ -162,16 +164,17 @@ void HeatBackward<T, D>::scatter(const HeatToParticlesBackwardArguments<T, D>& u
   a.value = constant(forms(value_, kHeatIncrement));
   if (up.gradient.pointer) a.moment = constant(forms(moment_, kHeatIncrement));
   a.deterministic = in_.lattice.deterministic();
-  a.nodes = {rows(adjoints_), 2, 2};
+  a.nodes = {rows(adjoints_), kHeatSolved, kOnCuda ? kHeatSolved : 2};
   backend::scatter(order(), a, stream_);
-  torch::stable::copy_(source_, torch::stable::select(adjoints_, 1, 0));
+  if (!kOnCuda) torch::stable::copy_(source_, torch::stable::select(adjoints_, 1, kIncrementAdjoint));
 }
 
 // λ of A λ = adjoint of the increment.
 template <class T, int D>
 void HeatBackward<T, D>::solve(HeatArguments<T, D> system, const Tensor& status) {
   system.theta = nullptr;
-  system.source = rows(source_);
+  system.source = kOnCuda ? rows(adjoints_) + kIncrementAdjoint : rows(source_);
+  system.source_stride = kOnCuda ? kHeatSolved : 1;
   system.tolerance = 0;
   system.relative_tolerance = in_.heat_scalars[3];
   system.increment = rows(multiplier_);
@@ -295,7 +298,7 @@ void HeatBackward<T, D>::gather(const HeatToNodesArguments<T, D>& down, bool by_
   GatherArguments<T, D> a;
   a.topology = down.topology;
   a.x = down.x;
-  if (!kGathersAtOnce || heat().holds_surface()) {
+  if (!kOnCuda || heat().holds_surface()) {
     a.nodes = {rows(solved_) + (kHeatAfter - kHeatChannels), kHeatSolved, 2};
     a.moment_scale = in_.lattice.inverse_inertia();
     a.moment = forms(moment_, kHeatAfter);

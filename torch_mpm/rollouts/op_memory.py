@@ -226,7 +226,7 @@ class _Sizes:
         if self._heat is not None:
             products = _SIMPLE_STEPS if self._cuda else 0
             of_terms = sum(isinstance(term, Term) for term in self._heat.boundaries.entries)
-            numbers += self._nodes(1) * (self._heat_nodes() + 6 + 4 + 2 + 8 + 8 + products) + 2 * of_terms + 20
+            numbers += self._nodes(1) * (self._heat_nodes() + 6 + 4 + 4 + 8 + 8 + products) + 2 * of_terms + 20
             numbers += 2 * self._tiles(resident=False)  # Of the steps and of the adjoint solves.
         return rows * self._node_rows() + self._slots * numbers * self._size + self._grid_bytes()
 
