@@ -63,15 +63,15 @@ struct HeatToParticlesPullBack : HeatAdjointSums<Order, T, D, 2, 0, Affine> {
 };
 
 // Adjoint of P2G with the gradients of θ + d and of λ, and the position gradient of all forms. The positions of the
-// particles are those of the activation.
-template <int Order_, class T_, int D_, bool Affine>
+// particles are those of the activation. Without gradients of the particles the moments of P2G and G2P are zero.
+template <int Order_, class T_, int D_>
 struct HeatToNodesPullBack {
   using T = T_;
   static constexpr int Order = Order_, D = D_, K = kHeatChannels, Others = kHeatSolved;
   static constexpr int resident = 3;
   static constexpr int first_gradient = kHeatAfter - K;
   static_assert(kHeatTheta == 2 && kHeatMean == 3 && first_gradient == 2 && Others == K);  // channels with moments
-  using OfSums = SumShape<Order, T, D, K, kHeatTheta, Affine, false, SlopeForm::none>;
+  using OfSums = SumShape<Order, T, D, K, kHeatTheta, true, false, SlopeForm::none>;
   using OfSolved = SumShape<Order, T, D, K, first_gradient, true, false, SlopeForm::none>;
   using Slope = SumShape<Order, T, D, K, K, false, false, SlopeForm::affine>;
   struct Loaded {
@@ -116,7 +116,7 @@ struct HeatToNodesPullBack {
       of_solved.moment[first_gradient][d] = dx * forms.after[d];
       of_solved.moment[first_gradient + 1][d] = dx * forms.multiplier[d];
     }
-    if (Affine) {
+    if (a.gradient.pointer) {
 #pragma unroll
       for (int k = 0; k < first_gradient; k++) {
         const Vector<T, D> moment = load_vector<D>(at, constant(entry(a.moment, K + k)));
@@ -149,7 +149,7 @@ struct HeatToNodesPullBack {
     for (int k = 0; k < K; k++) {
       gathered.value[k] = sums.value[k];
 #pragma unroll
-      for (int d = 0; d < D; d++) gathered.moment[k][d] = Affine && k >= kHeatTheta ? dx * sums.moment[k][d] : T(0);
+      for (int d = 0; d < D; d++) gathered.moment[k][d] = k >= kHeatTheta ? dx * sums.moment[k][d] : T(0);
     }
 #pragma unroll
     for (int d = 0; d < D; d++) {
@@ -253,10 +253,7 @@ void heat_surface_row_backward(const HeatSurfaceRowBackwardArguments<T, D>& a, S
 
 template <int Order, class T, int D>
 void heat_to_nodes_backward(const HeatToNodesBackwardArguments<T, D>& a, Stream stream) {
-  if (a.gradient.pointer)
-    launch_gather_of_vectors(HeatToNodesPullBack<Order, T, D, true>(a), stream);
-  else
-    launch_gather_of_vectors(HeatToNodesPullBack<Order, T, D, false>(a), stream);
+  launch_gather_of_vectors(HeatToNodesPullBack<Order, T, D>(a), stream);
 }
 
 MPM_HEAT_BACKWARD_KERNELS(MPM_INSTANTIATE, MPM_INSTANTIATE_ORDERS, MPM_INSTANTIATE_SIZE)
