@@ -56,24 +56,17 @@ void launch(void (*kernel)(Parameters...), unsigned blocks, unsigned threads, si
   check(cudaGetLastError());
 }
 
-// Number of concurrent thread blocks: as many of `blocks` as fit on the device.
-template <class Kernel>
-unsigned blocks_together(Kernel* kernel, unsigned blocks, unsigned threads, size_t shared_memory) {
-  allow_shared_memory(kernel, shared_memory);
-  int fitting = 0;
-  check(cudaOccupancyMaxActiveBlocksPerMultiprocessor(&fitting, kernel, int(threads), shared_memory));
-  const unsigned most = unsigned(fitting * device_attribute(cudaDevAttrMultiProcessorCount));
-  return std::clamp(blocks, 1u, std::max(most, 1u));
-}
-
 // Concurrent thread blocks that may wait for each other, as many of `blocks` as fit on the device.
 template <class... Parameters, class... Arguments>
 void launch_together(void (*kernel)(Parameters...), unsigned blocks, unsigned threads, size_t shared_memory,
                      cudaStream_t stream, Arguments... arguments) {
-  blocks = blocks_together(kernel, blocks, threads, shared_memory);
+  allow_shared_memory(kernel, shared_memory);
+  int fitting = 0;
+  check(cudaOccupancyMaxActiveBlocksPerMultiprocessor(&fitting, kernel, int(threads), shared_memory));
+  const unsigned most = unsigned(fitting * device_attribute(cudaDevAttrMultiProcessorCount));
   void* pointers[] = {&arguments...};
-  check(cudaLaunchCooperativeKernel(reinterpret_cast<const void*>(kernel), blocks, threads, pointers, shared_memory,
-                                    stream));
+  check(cudaLaunchCooperativeKernel(reinterpret_cast<const void*>(kernel), std::clamp(blocks, 1u, std::max(most, 1u)),
+                                    threads, pointers, shared_memory, stream));
 }
 
 }  // namespace mpm::cuda

@@ -65,20 +65,6 @@ void launch_in_chain(void (*kernel)(Parameters...), unsigned blocks, unsigned th
   check(cudaLaunchKernelEx(&config, kernel, Parameters(arguments)...));
 }
 
-// The same for concurrent thread blocks that may wait for each other by barriers of the grid, as launch_together().
-template <class... Parameters, class... Arguments>
-void launch_together_in_chain(void (*kernel)(Parameters...), unsigned blocks, unsigned threads, size_t shared_memory,
-                              cudaStream_t stream, const Arguments&... arguments) {
-  if (!has_grid_dependency_sync(kernel))
-    return launch_together(kernel, blocks, threads, shared_memory, stream, arguments...);
-  cudaLaunchAttribute attributes[2] = {overlap_attribute()};
-  attributes[1].id = cudaLaunchAttributeCooperative;
-  attributes[1].val.cooperative = 1;
-  blocks = blocks_together(kernel, blocks, threads, shared_memory);
-  const cudaLaunchConfig_t config = launch_config(attributes, 2, blocks, threads, shared_memory, stream);
-  check(cudaLaunchKernelEx(&config, kernel, Parameters(arguments)...));
-}
-
 constexpr unsigned kLargestCluster = 16;  // not every device supports more than 8
 
 // Concurrent thread blocks that may wait for each other, by wait_for_all(): few as one cluster, whose barriers are

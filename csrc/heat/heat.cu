@@ -1,7 +1,7 @@
 #include <cooperative_groups.h>
 
 #include "cuda/barrier.cuh"
-#include "cuda/programmatic_launch.cuh"
+#include "cuda/launch.cuh"
 #include "heat/operator.cuh"
 #include "heat/scene.cuh"
 
@@ -423,7 +423,6 @@ template <int Order, class T, int D>
 __global__ void __launch_bounds__(kHeatThreads<Order, T>, 1) heat_kernel(const HeatKernel<Order, T, D> kernel) {
   extern __shared__ uint4 dynamic[];
   auto& own = reinterpret_cast<WarpMemory<HeatShape<Order, T, D>>*>(dynamic)[threadIdx.x / 32];
-  grid_dependency_sync();
   if (!kernel.takes_any()) return;
   kernel.start(own);
   for (kernel.direct(true); *static_cast<volatile int*>(kernel.w.running) > 0; kernel.direct(false)) {
@@ -440,9 +439,14 @@ void heat_cg(const HeatArguments<T, D>& a, Stream stream) {
   if (small_scenes(t)) solve_scenes<Order, T, D>({a, kernel.w.packed.particles, kernel.w.v, kernel.w.apart}, stream);
   constexpr int threads = kHeatThreads<Order, T>,
                 shared_memory = threads / 32 * sizeof(WarpMemory<HeatShape<Order, T, D>>);
-  // Mostly all scenes are simple, and the kernel ends at once: its launch must not wait for the kernel before it.
-  launch_together_in_chain(heat_kernel<Order, T, D>, unsigned(most_thread_blocks(t)), threads, shared_memory, stream,
-                           kernel);
+  const auto function = heat_kernel<Order, T, D>;
+  int resident = 0;
+  check(cudaFuncSetAttribute(function, cudaFuncAttributeMaxDynamicSharedMemorySize, shared_memory));
+  check(cudaOccupancyMaxActiveBlocksPerMultiprocessor(&resident, function, threads, shared_memory));
+  const unsigned blocks = unsigned(
+      std::min<int64_t>(most_thread_blocks(t), int64_t(device_attribute(cudaDevAttrMultiProcessorCount)) * resident));
+  void* arguments[] = {&kernel};
+  check(cudaLaunchCooperativeKernel(function, blocks, threads, arguments, shared_memory, stream));
 }
 
 template <class T, int D>
