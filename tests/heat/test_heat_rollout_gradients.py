@@ -13,7 +13,7 @@ from benchmarks.catalogue.laws import named
 from torch_mpm import heat_boundaries
 from torch_mpm.laws.parameters import PerMaterial
 from torch_mpm.rollouts import plan_rollout
-from torch_mpm.rollouts.op_memory import recorded_bytes
+from torch_mpm.rollouts.op_memory import _Sizes, recorded_bytes
 
 F64 = torch.float64
 STATE = ("x", "v", "C", "F", "J", "mass", "volume", "temperature")
@@ -56,6 +56,10 @@ def with_leaves(step, state):
             leaves[name] = torch.as_tensor(value).to(state.x).detach().clone().requires_grad_()
             setattr(step.heat, name, leaves[name])
     return state, leaves
+
+
+DENSE = {2: 256, 3: 64}
+"""Particles of a cell with which records have the nodes of each step, by dimension."""
 
 
 def loss_of(end, of=ALL):
@@ -161,9 +165,38 @@ def test_stiff_conduction(device):
 @pytest.mark.parametrize("checkpoint", [2, mpm.Checkpoints(memory=1e9)])
 def test_many_particles_in_a_cell(conductivity, checkpoint, device):
     """Their record has the nodes and the increments of each solve, which the adjoint does not compute once more."""
-    step, state = scene(2, per_cell=64, device=device)
+    step, state = scene(2, per_cell=DENSE[2], device=device)
     step.heat.conductivity = conductivity
     compare(step, state, 3, tolerance=1e-8, checkpoint=checkpoint)
+
+
+@pytest.mark.parametrize(
+    *in_pairs(
+        boundary=["none", "nodes", "surface", "terms", "plastic"], melts=[False, True], transfer=TRANSFERS, dim=[2, 3],
+        recorded=[False, True], dtype=[F64, torch.float32], deterministic=[False, True],
+    )
+)  # fmt: skip
+def test_recorded_nodes(boundary, melts, transfer, dim, recorded, dtype, deterministic, device):
+    """Of many particles in a cell: all that a step has at its nodes is recorded, for each kind of boundary."""
+    law, scenes = "von_mises" if boundary == "plastic" else "neo_hookean", 2
+    step, state = scene(
+        dim, dtype, scenes, law, melts=melts, transfer=transfer, deterministic=deterministic, per_cell=DENSE[dim]
+    )
+    ball = step.boundaries.entries[0]
+    if boundary in ("nodes", "surface"):
+        kind = heat_boundaries.Fixed if boundary == "nodes" else heat_boundaries.FixedSurface
+        step = held(step, (kind, ball, torch.linspace(20.0, 30.0, scenes, dtype=dtype)))
+    elif boundary == "terms":
+        made = terms(scenes)
+        step.heat.boundaries = [*made["convection"], *made["radiation"], *made["source"]]
+    elif boundary == "plastic":
+        step.heat.plastic_heating = 0.9
+    step, state = step.to(device), state.to(device=device)
+    prepared = step.prepare(state)
+    pool = step.grid.measured_pool(prepared.x, prepared.scene)
+    assert not _Sizes(step, prepared, pool)._grid_is_shared()
+    checkpoint = mpm.Checkpoints(memory=1e9) if recorded else 2
+    compare(step, state, 3, tolerance=1e-8 if dtype == F64 else 2e-3, checkpoint=checkpoint)
 
 
 def test_parameters_of_materials(device):

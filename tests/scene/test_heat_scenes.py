@@ -13,8 +13,8 @@ pytest.importorskip("h5py")
 
 import torch_mpm as mpm
 from torch_mpm import Trajectory
-from torch_mpm.scene.diagnose import SceneFailure
 from torch_mpm.scene import Scene
+from torch_mpm.scene.diagnose import SceneFailure
 from torch_mpm.scene.explain import SceneError
 from torch_mpm.scene.run import Interrupted
 
