@@ -75,7 +75,7 @@ struct HeatNodesBackwardArguments {
   const T* theta = nullptr;       // averages before it
   const T* multiplier = nullptr;  // λ
   const T* product = nullptr;     // H λ
-  const T* adjoints = nullptr;    // of the increment and θ̄ [N, kHeatSolved], of which the others are unused
+  const T* adjoints = nullptr;    // of the increment and θ̄ [N, kHeatSolved]; the other channels are unused
   const T* exchange = nullptr;    // [N], as those below; absent without boundaries
   const T* by_terms = nullptr;    // adjoint of θ by the terms of the boundary
   const bool* fixed = nullptr;

@@ -13,11 +13,10 @@ from .mixture import Mixture
 from .parameters import Overlay
 from .thermal_calls import (
     is_thermal,
-    parameters_of_call,
+    parts_of_call,
     phases_of,
     table_of_coherency,
     tables_of_expansion,
-    tables_of_parameters,
 )
 
 
@@ -82,11 +81,13 @@ def law_calls(law: Material, state: Any, dt: float | Tensor | None = None, heate
     return calls
 
 
-def _add(calls: LawCalls, law: CompiledLaw, state: Any, dt: float | Tensor | None, has_tables: bool = False) -> str:
-    """Add a law to calls, of which tables may replace parameters; returns its name."""
+def _add(
+    calls: LawCalls, law: CompiledLaw, state: Any, dt: float | Tensor | None, parameters: list[Tensor] | None = None
+) -> str:
+    """Add a law to calls; returns its name. The parameters are those of the state unless they are given."""
     with_dt: Any = state if dt is None or not law.rate_dependent else Overlay(state, dt=dt)
     calls.options.append(law.option_bits())
-    calls.parameters.extend(parameters_of_call(law, with_dt, state.x) if has_tables else law._arguments(with_dt)[1])
+    calls.parameters.extend(law._arguments(with_dt)[1] if parameters is None else parameters)
     history = law._history(state)
     calls.variables.append(len(history))
     calls.history.extend(history)
@@ -105,14 +106,20 @@ def _add_phases(calls: LawCalls, law: Material, state: Any, dt: float | Tensor |
             calls.thermal.extend((len(calls.options) - 1, what, len(calls.tables)))
             calls.tables.append(table)
 
-    name = _add(calls, solid, state, dt, has_tables=True)
-    add_tables(tables_of_parameters(solid, x))
+    def add_phase(phase: CompiledLaw) -> str:
+        found = parts_of_call(phase, x)
+        assert found is not None
+        parameters, tables = found
+        name = _add(calls, phase, state, dt, parameters)
+        add_tables(tables)
+        return name
+
+    name = add_phase(solid)
     if phases.expanding is not None:
         add_tables(tables_of_expansion(phases.expanding, x))
     calls.history_names.append(solid.history_names())
     if melting is not None:
         liquid: CompiledLaw = melting.liquid  # type: ignore[assignment]
-        name += f"~{_add(calls, liquid, state, dt, has_tables=True)}"
-        add_tables(tables_of_parameters(liquid, x))
+        name += f"~{add_phase(liquid)}"
         add_tables(table_of_coherency(melting, x))
     calls.names.append(name)

@@ -117,19 +117,21 @@ def tables_of_parameters(law: CompiledLaw, x: Tensor) -> Tables | None:
     Cached while nothing has changed. Where they are differentiated, their knots are, and the values at these are
     computed again.
     """
+    found = parts_of_call(law, x)
+    return None if found is None else found[1]
+
+
+def parts_of_call(law: CompiledLaw, x: Tensor) -> tuple[list[Tensor] | None, Tables] | None:
+    """Parameters of a law in a call of the op, and tables, which replace those parameters that are functions of the
+    temperature: these have any value. The parameters are None where they are those of the state. None where
+    `tables_of_parameters` is."""
     found = _at_knots(law, x)
     if found is None:
         return None
-    return _tables_at(law, found.knots, x) if found.is_differentiated else found.tables
-
-
-def parameters_of_call(law: CompiledLaw, state: Any, x: Tensor) -> list[Tensor]:
-    """Parameters of a law in a call of the op, where tables replace those that are functions of the temperature: these
-    have any value."""
-    found = None if law.rate_dependent else _at_knots(law, x)
-    if found is None or found.is_differentiated or not found.tables:
-        return law._arguments(state)[1]
-    return found.parameters
+    if found.is_differentiated:
+        return None, _tables_at(law, found.knots, x)
+    is_kept = found.tables and not law.rate_dependent
+    return found.parameters if is_kept else None, found.tables
 
 
 class _AtKnots(NamedTuple):
