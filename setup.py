@@ -57,6 +57,9 @@ NVCC_FLAGS = [
 # Files *.op.cpp are host code, which launches kernels: with -O2 it is a seventh smaller.
 NVCC_LEVELS = {"nvcc": "-O3", "nvcc_host": "-O2"}
 
+# Compiles the kernels of a law in a tenth of the time; the kernels are several times slower (CUDA 12.9 or newer).
+NVCC_FAST_COMPILE = "--Ofast-compile=max"
+
 # Definitions that distinguish the objects of one source.
 VARIANTS = ("-DTORCH_MPM_ISA=", "-DMPM_SCALAR=", "-DMPM_DIMENSION=", "-DMPM_LAW_HEADER=")
 
@@ -94,15 +97,17 @@ def best_level() -> str:
 def cuda_wanted(native: bool) -> bool:
     """Whether to build the CUDA library: where nvcc is found and, if for this machine only, it has a GPU.
 
-    TORCH_MPM_CUDA, 1 or 0, overrides this.
+    TORCH_MPM_CUDA, 1, 0 or check, overrides this.
     """
     choice = os.environ.get("TORCH_MPM_CUDA", "")
-    if choice not in ("", "0", "1"):
-        raise SystemExit(f"TORCH_MPM_CUDA must be 0, 1 or unset, got {choice!r}")
-    if choice == "1" and nvcc() is None:
-        raise SystemExit("TORCH_MPM_CUDA=1, but nvcc is neither in CUDA_HOME/bin nor in PATH")
+    if choice not in ("", "0", "1", "check"):
+        raise SystemExit(f"TORCH_MPM_CUDA must be 0, 1, check or unset, got {choice!r}")
+    if choice == "check" and not native:
+        raise SystemExit("TORCH_MPM_CUDA=check compiles slow kernels, which no wheel may have: use 1, 0 or unset")
+    if choice in ("1", "check") and nvcc() is None:
+        raise SystemExit(f"TORCH_MPM_CUDA={choice}, but nvcc is neither in CUDA_HOME/bin nor in PATH")
     if choice or nvcc() is None:
-        return choice == "1"
+        return choice in ("1", "check")
     if native and not gpu_present():
         print("The CUDA library is left out, since this machine has no GPU; TORCH_MPM_CUDA=1 builds it all the same.")
         return False
@@ -135,11 +140,20 @@ def gencode() -> list[str]:
     return [*options, f"-gencode=arch=compute_{numbers[-1]},code=compute_{numbers[-1]}"]
 
 
-def compression() -> str:
-    """Option of nvcc that compresses fat binaries, which are large for template kernels. The smallest ones need the
-    driver of CUDA 12.4, which every driver of CUDA 13 is newer than, but not every one of CUDA 12."""
-    release = re.search(r"release (\d+)", compiler_version(str(nvcc())))
-    return "--compress-mode=size" if release and int(release[1]) >= 13 else "-Xfatbin=-compress-all"
+def nvcc_release() -> tuple[int, int]:
+    release = re.search(r"release (\d+)\.(\d+)", compiler_version(str(nvcc())))
+    return (int(release[1]), int(release[2])) if release else (0, 0)
+
+
+def nvcc_flags() -> list[str]:
+    """Options of nvcc: compressed fat binaries, which are large for template kernels, or compilation in little time.
+
+    The smallest fat binaries need the driver of CUDA 12.4, which every driver of CUDA 13 is newer than, but not every
+    one of CUDA 12. TORCH_MPM_CUDA=check asks for little time: a machine without a GPU compiles to find errors.
+    """
+    if os.environ.get("TORCH_MPM_CUDA") == "check" and nvcc_release() >= (12, 9):
+        return [*NVCC_FLAGS, NVCC_FAST_COMPILE, "--compress-mode=none"]
+    return [*NVCC_FLAGS, "--compress-mode=size" if nvcc_release() >= (13, 0) else "-Xfatbin=-compress-all"]
 
 
 def max_jobs() -> int:
@@ -198,7 +212,7 @@ class Ninja:
             # The host compiler sees `#pragma unroll`, which only the device compiler knows.
             host = f"-Xcompiler={','.join([*HOST_FLAGS, '-Wno-unknown-pragmas'])}"
             before = [str(nvcc()), f"-ccbin={cxx}", *gencode(), *COMMON_FLAGS]
-            after = [*NVCC_FLAGS, compression(), host, "-DUSE_CUDA", *torch_includes]
+            after = [*nvcc_flags(), host, "-DUSE_CUDA", *torch_includes]
             for rule, level in NVCC_LEVELS.items():
                 device = [*before, level, *after, "$flags", "-MD", "-MF", "$out.d", "-c", "$in", "-o", "$out"]
                 self.rule(rule, device, depfile=True)
@@ -374,7 +388,7 @@ class Build(build_ext):
             record["cpu"] = {"compiler": compiler, "flags": CPU_FLAGS, "isa": list(self.levels), "sanitize": sanitize}
         if "cuda" in built:
             compiler = compiler_version(str(nvcc()))
-            flags = [NVCC_LEVELS["nvcc"], *NVCC_FLAGS, compression()]
+            flags = [NVCC_LEVELS["nvcc"], *nvcc_flags()]
             record["cuda"] = {"compiler": compiler, "flags": flags, "archs": cuda_archs()}
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(record, indent=2) + "\n")

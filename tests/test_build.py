@@ -47,13 +47,43 @@ def test_the_variable_decides_where_it_is_set(machine: Path, monkeypatch: pytest
     monkeypatch.setenv("TORCH_MPM_CUDA", "0")
     assert not setup.cuda_wanted(native)
     monkeypatch.setenv("TORCH_MPM_CUDA", "yes")
-    with pytest.raises(SystemExit, match="TORCH_MPM_CUDA must be 0, 1 or unset, got 'yes'"):
+    with pytest.raises(SystemExit, match="TORCH_MPM_CUDA must be 0, 1, check or unset, got 'yes'"):
         setup.cuda_wanted(native)
 
 
-def test_cuda_without_its_compiler_is_refused(machine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("release", "choice", "option"),
+    [
+        ("13.0", "check", setup.NVCC_FAST_COMPILE),
+        ("12.9", "check", setup.NVCC_FAST_COMPILE),
+        ("12.8", "check", "-Xfatbin=-compress-all"),
+        ("12.9", "1", "-Xfatbin=-compress-all"),
+        ("13.0", "1", "--compress-mode=size"),
+    ],
+)
+def test_options_of_nvcc_are_those_of_its_release(
+    machine: Path, monkeypatch: pytest.MonkeyPatch, release: str, choice: str, option: str
+) -> None:
+    program(machine, "nvcc", f"Cuda compilation tools, release {release}, V{release}.88")
+    monkeypatch.setenv("TORCH_MPM_CUDA", choice)
+    monkeypatch.setattr(setup, "compiler_version", setup.compiler_version.__wrapped__)
+    assert setup.cuda_wanted(native=True)
+    options = setup.nvcc_flags()
+    assert option in options
+    assert (setup.NVCC_FAST_COMPILE in options) == (option == setup.NVCC_FAST_COMPILE)
+
+
+def test_a_wheel_of_slow_kernels_is_refused(machine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TORCH_MPM_CUDA", "check")
+    assert setup.cuda_wanted(native=True)
+    with pytest.raises(SystemExit, match="TORCH_MPM_CUDA=check compiles slow kernels, which no wheel may have"):
+        setup.cuda_wanted(native=False)
+
+
+@pytest.mark.parametrize("choice", ["1", "check"])
+def test_cuda_without_its_compiler_is_refused(machine: Path, monkeypatch: pytest.MonkeyPatch, choice: str) -> None:
     (machine / "nvcc").unlink()
-    monkeypatch.setenv("TORCH_MPM_CUDA", "1")
+    monkeypatch.setenv("TORCH_MPM_CUDA", choice)
     with pytest.raises(SystemExit, match="nvcc is neither in CUDA_HOME/bin nor in PATH"):
         setup.cuda_wanted(native=True)
 

@@ -299,7 +299,7 @@ void HeatBackward<T, D>::gather(const HeatToNodesArguments<T, D>& down, bool by_
   a.topology = down.topology;
   a.x = down.x;
   if (!kOnCuda || heat().holds_surface()) {
-    a.nodes = {rows(solved_) + (kHeatAfter - kHeatChannels), kHeatSolved, 2};
+    a.nodes = {rows(solved_) + (int(kHeatAfter) - int(kHeatChannels)), kHeatSolved, 2};
     a.moment_scale = in_.lattice.inverse_inertia();
     a.moment = forms(moment_, kHeatAfter);
     backend::gather(order(), a, stream_);
