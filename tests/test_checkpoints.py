@@ -54,7 +54,7 @@ KEPT = {
     "two states": mpm.Checkpoints(states=2),
     "four states": mpm.Checkpoints(states=4),
     "two states of three steps": mpm.Checkpoints(every=3, states=2),
-    "little memory": mpm.Checkpoints(memory=4.8e5),
+    "little memory": mpm.Checkpoints(memory=5.2e5),
     "much memory": mpm.Checkpoints(memory=1e9),
 }
 

@@ -122,7 +122,7 @@ constexpr int kWorthATeam = 16;
 
 // Iterations until all scenes are done: of a graph that the device ends, or with checks by the host.
 template <class T, int D, class Iteration>
-void iterate(ConjugateGradientsArguments<T, D>& a, [[maybe_unused]] const Tensor& x, backend::Stream stream,
+void iterate(ConjugateGradientsArguments<T, D> a, [[maybe_unused]] const Tensor& x, backend::Stream stream,
              const Iteration& iteration) {
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda && CUDART_VERSION >= 13000
   if (a.max_iterations == 0 || a.max_blocks == 0 || a.scenes == 0) return;

@@ -36,7 +36,7 @@ struct CamClay : HenckyElasticity {
     c.initial = p[3] * inverse;
     const Ellipse<T> trial = ellipse(c, T(0));
     const T outside = c.shear * c.shear + c.M * c.M * trial.size * trial.size * (trial.cosine * trial.cosine - T(1));
-    const auto plastic = stiff & (outside > T(0));
+    const MaskOf<T> plastic = stiff & (outside > T(0));
 
     const Compaction<T> w = compaction(c, plastic);
     const Ellipse<T> e = ellipse(c, w.value);

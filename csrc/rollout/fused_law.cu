@@ -62,12 +62,12 @@ struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true, false> 
 
   // Inputs of the law at a particle, except its history.
   __device__ void fetch(int p, Changes& changes) const {
-    if constexpr (!moves_F) {
-      changes.J = state.at(p);
-      return;
-    }
+    if constexpr (moves_F) {
 #pragma unroll
-    for (int k = 0; k < D * D; k++) changes.F[k / D][k % D] = state.at(p, k);
+      for (int k = 0; k < D * D; k++) changes.F[k / D][k % D] = state.at(p, k);
+    } else {
+      changes.J = state.at(p);
+    }
   }
   __device__ Parameters parameters(int p) const {
     Parameters r;

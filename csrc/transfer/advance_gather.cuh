@@ -185,10 +185,10 @@ struct OwnAdvanceGather : AdvanceGather<2, T, D, false, true, Ends> {
  private:
   __device__ int target(int p) const { return Ends ? own.origin[p] : own.place(p); }
   __device__ void give_history(int p, int to) const {
-    if constexpr (!Ends) return;
-    for (int k = 0; k < own.columns; k++)
-      own.history_next.pointer[to * own.history_next.stride[0] + k * own.history_next.stride[1]] =
-          own.history.pointer[p * own.history.stride[0] + k * own.history.stride[1]];
+    if constexpr (Ends)
+      for (int k = 0; k < own.columns; k++)
+        own.history_next.pointer[to * own.history_next.stride[0] + k * own.history_next.stride[1]] =
+            own.history.pointer[p * own.history.stride[0] + k * own.history.stride[1]];
   }
 };
 

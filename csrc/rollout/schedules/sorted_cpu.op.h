@@ -306,7 +306,7 @@ bool SortedCpu<T, D>::tries_to_last(int64_t following) {
 template <class T, int D>
 bool SortedCpu<T, D>::lasts(int64_t following) {
   if (!tries_ || following < kLeastPasses) return false;
-  displacement_ = {whereabouts_.out_of_block, 0, displacement_.earlier + displacement_.out_of_block};
+  displacement_ = {whereabouts_.out_of_block, 0, displacement_.earlier + displacement_.out_of_block, 0};
   const bool result = displacement_.lasts(in_.x.size(0), kCpuOutOfBlockCost) && reaches();
   if (!result && passes_ == 0) patience_ = kActivationsOfPatience;
   return result;
