@@ -242,6 +242,38 @@ def test_free_surface_and_sources_of_scenes(per_particle, device):
     compare(step, state, 6, torch.tensor([1.0, 2.0, 0.5], dtype=torch.float64) * DT)
 
 
+@pytest.mark.parametrize("seed", range(32))
+def test_float32_with_boundaries(seed, device):
+    """Boundaries, transfers, and solves of one to three simple steps or by conjugate gradients; on CUDA these have one
+    kernel, for one or several items of a block."""
+    r = random.Random(seed)
+    dim, scenes = r.choice((2, 3)), r.choice((1, 3))
+    per_cell = r.choice((2**dim, 40 if dim == 2 else 20))
+    step, state = scene(
+        dim, torch.float32, scenes, melts=r.random() < 0.5, transfer=r.choice(TRANSFERS), per_cell=per_cell,
+        max_blocks=scenes * 3**dim, device=device,
+    )  # fmt: skip
+    conductivity = r.choice((20.0, 2000.0, 4e4, 2e6))
+    step.heat.conductivity = torch.full((scenes,), conductivity, device=device) if scenes > 1 else conductivity
+    step.heat.tolerance = 1e-6
+    step.heat.reference = 290.0
+    free = terms(scenes)
+    chosen = r.choice(([], *free.values(), [term for own in free.values() for term in own]))
+    region, plate = bodies(dim)["sphere"], bodies(dim)["plane"]
+    kinds = [(heat_boundaries.FixedSurface, region, 40.0), (heat_boundaries.Fixed, plate, -5.0)]
+    step = held(step, *r.choice(([], kinds[:1], kinds[1:], kinds)))
+    step.heat.boundaries = [*chosen, *step.heat.boundaries.entries]
+    x = state.x.clone()
+    x[3] = 5.0  # outside
+    dt = torch.linspace(0.5, 1, scenes) * DT if scenes > 1 else DT
+    compare(step, state.replace(x=x), r.choice((1, 4, 9)), dt, tolerance=1e-3)
+
+
+def test_many_particles_in_float32(device):
+    """More than one kernel of heat holds at once on CUDA."""
+    compare(*scene(3, torch.float32, melts=True, per_cell=14**3, device=device), n=5, tolerance=1e-3)
+
+
 def test_heat_of_a_source_is_its_energy(device):
     """Without another boundary the content grows by power times volume times time."""
     step, state = scene(3, device=device)
