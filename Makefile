@@ -39,7 +39,7 @@ test: build
 	OMP_WAIT_POLICY=PASSIVE $(PY) -m pytest $(QUICK) $(THREADED) -k "not gradcheck and not opcheck and not compile"
 
 thorough: build
-	OMP_NUM_THREADS=1 $(PY) -m pytest -q -m thorough -n auto --dist worksteal
+	OMP_NUM_THREADS=1 $(PY) -m pytest -q -m "thorough and not slow" -n auto --dist worksteal
 
 check: $(STAMP)
 	$(PY) -m ruff check .

@@ -51,6 +51,7 @@ def test_a_library_without_the_sanitizers_asked_for_is_an_error() -> None:
     assert "is not built with TORCH_MPM_SANITIZE=thread" in done.stderr
 
 
+@pytest.mark.thorough
 def test_the_package_that_the_environment_names_is_tested(tmp_path: Path) -> None:
     (tmp_path / "torch_mpm").mkdir()
     (tmp_path / "torch_mpm" / "__init__.py").write_text("raise ImportError('another build')")

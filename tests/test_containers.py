@@ -84,6 +84,7 @@ class Throws(Dataset):
         return {"start": state.replace(v=state.v + k), "target": torch.tensor(float(k))}
 
 
+@pytest.mark.thorough(context="spawn")
 @pytest.mark.parametrize(("workers", "context"), [(0, None), (2, "fork"), (1, "spawn")])
 def test_a_data_loader_makes_batches_of_scenes(workers, context):
     """Also from worker processes; each scene moves as it does alone."""

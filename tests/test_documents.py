@@ -12,6 +12,7 @@ PACKAGES = {"bodies.md": ["mujoco"], "tutorial.md": ["mujoco"], "envs.md": ["gym
 
 
 @pytest.mark.thorough(name="tutorial.md")
+@pytest.mark.thorough(name="training.md")
 @pytest.mark.filterwarnings("ignore:Anomaly Detection")
 @pytest.mark.parametrize("name", ["training.md", "recipes.md", "splats.md", "bodies.md", "envs.md", "tutorial.md"])
 def test_programs_of_a_document(name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -81,6 +81,7 @@ def test_the_report_names_law_and_ratio():
     assert 'kernel="cubic"' in text
 
 
+@pytest.mark.thorough
 def test_commands_report_it_in_one_line(tmp_path):
     scene = tmp_path / "scene.toml"
     scene.write_text(

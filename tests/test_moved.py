@@ -64,6 +64,7 @@ def test_packages_that_were_modules(package, name):
         module.nothing  # noqa: B018
 
 
+@pytest.mark.thorough
 def test_torch_mpm_itself_uses_the_new_paths():
     program = (
         "import importlib, pkgutil, torch_mpm\n"

@@ -96,6 +96,7 @@ def test_info_describes_build_and_devices() -> None:
     assert values["cuda"]["usable"] == (torch.cuda.is_available() and _library.cuda_error is None)
 
 
+@pytest.mark.thorough
 def test_command_line_prints_info() -> None:
     command = [sys.executable, "-m", "torch_mpm", "info"]
     output = subprocess.run(command, check=True, capture_output=True, text=True).stdout
@@ -132,6 +133,7 @@ def run_python(directory: Path, script: str) -> subprocess.CompletedProcess[str]
     return subprocess.run([sys.executable, "-c", script], cwd=directory, capture_output=True, text=True)
 
 
+@pytest.mark.thorough
 def test_import_without_libraries_says_how_to_build(tmp_path: Path) -> None:
     copy_package(tmp_path, "*.so")
     result = run_python(tmp_path, "import torch_mpm")
@@ -147,6 +149,7 @@ def test_import_of_a_foreign_library_names_the_file(tmp_path: Path) -> None:
     assert f"ImportError: torch_mpm cannot load {library}" in result.stderr
 
 
+@pytest.mark.thorough
 def test_info_says_that_the_cuda_library_is_missing(tmp_path: Path) -> None:
     copy_package(tmp_path, _library.CUDA_LIBRARY.name)
     result = run_python(tmp_path, "import json; from torch_mpm.info import info; print(json.dumps(info()['cuda']))")
@@ -154,6 +157,7 @@ def test_info_says_that_the_cuda_library_is_missing(tmp_path: Path) -> None:
     assert "built without its CUDA library" in json.loads(result.stdout)["reason"]
 
 
+@pytest.mark.thorough
 def test_old_names_of_modules_are_the_same_modules() -> None:
     program = (
         "import torch_mpm; import torch_mpm.heat_boundaries as old; import torch_mpm.heat.boundaries as new; "

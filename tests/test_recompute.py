@@ -137,6 +137,7 @@ print([name for name in sys.modules if name.startswith("torch._dynamo")])
 """
 
 
+@pytest.mark.thorough
 def test_no_compiler_is_imported():
     """An import would delay the first rollout with checkpoints by seconds."""
     done = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True)

@@ -151,6 +151,7 @@ def test_a_budget_is_kept(kind, share, hooked):
     assert memory.of_host_allocator(run) <= budget
 
 
+@pytest.mark.thorough
 def test_recomputed_tensors_that_no_gradient_reaches_are_released():
     """Of steps whose loss does not depend on their temperatures, with few stored states: not those of all steps."""
     step, state = heat_scenes.scene(2, torch.float32, per_cell=4)

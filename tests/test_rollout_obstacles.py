@@ -271,6 +271,7 @@ print([name for name in ("sympy", "torch._dynamo") if name in sys.modules])
 """
 
 
+@pytest.mark.thorough
 def test_no_compiler_is_imported():
     """The import takes two seconds; torch.broadcast_shapes and forward derivatives cause it."""
     done = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True)

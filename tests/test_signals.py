@@ -147,6 +147,7 @@ except KeyboardInterrupt:
 """
 
 
+@pytest.mark.thorough
 def test_interrupts_of_a_process():
     with subprocess.Popen([sys.executable, "-c", PROGRAM], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None

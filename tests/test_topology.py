@@ -174,6 +174,7 @@ def test_a_domain_of_4096_cells_along_each_axis():
     assert float((end.x - state.x).norm(dim=1).min()) > 0.1
 
 
+@pytest.mark.thorough
 def test_a_large_domain_after_descriptors_were_closed():
     """As daemons do: another file may have the number of that which large tables are mapped from."""
     program = """

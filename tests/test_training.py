@@ -241,6 +241,7 @@ def _rank(rank, world, place, scenes):
     os._exit(0)
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(not torch.distributed.is_available(), reason="torch without torch.distributed")
 def test_two_processes_have_the_gradients_of_one(tmp_path):
     """Scenes are split over the ranks; their mean loss has the gradients of all scenes in one batch."""

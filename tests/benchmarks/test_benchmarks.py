@@ -91,6 +91,7 @@ def test_bodies_are_stable_where_the_velocity_is_solved_for(tmp_path: Path) -> N
     assert all(0 < row["penalty"]["penetration"] < 1 for row in heavy)
 
 
+@pytest.mark.thorough
 def test_failed_part_is_reported_and_the_others_go_on(monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*_: object) -> None:
         raise RuntimeError("no such device")

@@ -10,6 +10,7 @@ from benchmarks import beside, beside_worker, common
 NAME = "2-D, 9216 particles, 1 obstacles"
 
 
+@pytest.mark.thorough
 def test_both_versions_compute_the_scene(tmp_path: Path) -> None:
     """With its own sources as the other version, `before` and `now` are times of the same library."""
     beside.main([str(common.ROOT), "--only", NAME, "--steps", "2", "--rounds", "1", "--out", str(tmp_path)])

@@ -28,6 +28,7 @@ print(json.dumps([[r.name, r.end, r.error] for r in calls.fuzz(1500, seed=0)]))
 """
 
 
+@pytest.mark.thorough
 def test_no_call_crashes_or_ends_in_an_unclear_error(tmp_path: Path) -> None:
     """In a process of its own, that sees no GPU: one that has used CUDA must not fork."""
     environment = os.environ | {"CUDA_VISIBLE_DEVICES": "", "PYTHONPATH": os.pathsep.join(sys.path)}

@@ -60,6 +60,7 @@ def test_what_does_not_fit_is_a_row_without_a_time(monkeypatch: pytest.MonkeyPat
     assert "does not fit" in training.common.table(training.BESIDE, training.rows_of_peers({"peers": [row]}))
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(not memory.Resident.available, reason="/proc/self/clear_refs cannot be written to")
 def test_resident_memory_of_a_case_is_that_of_its_tensors() -> None:
     """Tensors that ops return, counted here, against the memory that the system reports for another process."""

@@ -129,6 +129,7 @@ def test_gradients(dim, device):
     assert torch.autograd.gradgradcheck(loss, leaves, eps=1e-7, atol=1e-4, nondet_tol=nondet, fast_mode=True)
 
 
+@pytest.mark.thorough
 def test_a_rollout_around_a_sampled_mesh_goes_in_one_op(device):
     """And as with the mesh itself, to the spacing."""
     trimesh = pytest.importorskip("trimesh")

@@ -168,6 +168,7 @@ def test_commands_report_a_flipped_bit_of_an_attribute(tmp_path, capsys, name, s
     assert sorted(path.name for path in folder.iterdir()) == ["dataset.json", "shards"]
 
 
+@pytest.mark.thorough(name="viewer")
 @pytest.mark.parametrize("name", READERS)
 def test_readers_report_a_flipped_bit_of_an_attribute(tmp_path, name):
     folder = datasets.make_dataset(tmp_path / "set")

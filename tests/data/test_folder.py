@@ -75,6 +75,7 @@ def _first_mass(data):
     return float(data.scene(9)["mass"][0])
 
 
+@pytest.mark.thorough(method="spawn")
 @pytest.mark.parametrize("method", ["fork", "spawn"])
 def test_other_processes_open_files_of_their_own(path, method):
     data = DatasetFolder(path)

@@ -74,6 +74,7 @@ def test_what_is_in_a_data_set(whole):
         assert json.loads(attributes["scene"])["duration"] == pytest.approx(0.055)
 
 
+@pytest.mark.thorough
 def test_one_and_three_processes_make_the_same(whole, tmp_path):
     processes = [start(tmp_path / "set", rank, 3, threads=1 + rank % 2) for rank in range(3)]
     for process in processes:
@@ -100,6 +101,7 @@ def test_each_device_makes_the_same_again(device, tmp_path):
             assert error < 1e-4, (name, key, error)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kills", [5, pytest.param(20, marks=pytest.mark.slow)])
 def test_a_data_set_that_is_killed_and_resumed_is_the_same(tmp_path, kills):
     changes = {"dataset__splits": {"train": 8 * kills}, "dataset__scenes_per_shard": 1}
@@ -299,6 +301,7 @@ def test_metadata_of_earlier_versions_or_none(copy):
     assert list(verify(copy)) == []
 
 
+@pytest.mark.thorough
 def test_a_full_disk_keeps_what_is_finished(whole, tmp_path):
     (tmp_path / "set.toml").write_text(json_to_toml())
     size = shard_path(whole, 0).stat().st_size
@@ -461,6 +464,7 @@ def test_a_scene_that_needs_too_many_steps_fails_alone(tmp_path):
     assert all("substeps, more than" in s.failure for s in attempted if not s.valid)
 
 
+@pytest.mark.thorough
 def test_a_scene_without_room_is_recorded(tmp_path):
     made = configuration(body__0__count={"choice": [1, 30], "weights": [1, 8]}, dataset__splits={"train": 3})
     generate(made, tmp_path, device="cpu")

@@ -47,6 +47,7 @@ def new_model(data):
     return example.Simulator(example.Domain.of(data, data.motion("train"), torch.device("cpu")))
 
 
+@pytest.mark.thorough
 def test_it_learns_from_the_disk_and_online_alike(data, configuration, tmp_path, monkeypatch):
     """The same windows in another order: both end at about the same loss, and well ahead of the baseline."""
     monkeypatch.setattr(example, "WIDTH", 32)

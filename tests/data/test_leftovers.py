@@ -45,6 +45,7 @@ def test_only_what_nobody_finishes_any_more_is_removed(tmp_path, monkeypatch):
     assert sorted(tmp_path.iterdir()) == sorted([own, elsewhere, *others])
 
 
+@pytest.mark.thorough(command="render")
 @pytest.mark.parametrize("command", ["export", "export --vtk", "generate", "render"])
 def test_the_next_call_removes_what_a_kill_has_left(tmp_path, monkeypatch, command):
     path = datasets.make_dataset(tmp_path / "set")

@@ -132,6 +132,7 @@ def test_what_cannot_be():
         next(iter(DataLoader(stream(), batch_size=None, num_workers=1)))
 
 
+@pytest.mark.thorough
 def test_windows_of_a_configuration_are_those_of_its_data_set(tmp_path, device):
     """From memory and from the disk: the same scenes, bit for bit, where a round is a shard."""
     pytest.importorskip("h5py")

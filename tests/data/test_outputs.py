@@ -115,6 +115,7 @@ LARGEST = {
 """File of an output that a small disk cannot hold."""
 
 
+@pytest.mark.thorough
 def test_a_disk_that_is_full_anywhere_is_one_line_with_the_file(source, tmp_path):
     """In a process of its own, since HDF5 can crash now or at its end."""
     calls, expected = [], []

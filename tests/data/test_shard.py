@@ -183,6 +183,7 @@ print("survived")
 """
 
 
+@pytest.mark.thorough
 def test_hdf5_survives_a_disk_that_is_full_anywhere(path):
     """HDF5 crashes, now or at the end of the process, when it learns of a write that failed."""
     write_shard(path.parent.parent, 0)

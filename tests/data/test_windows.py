@@ -76,6 +76,7 @@ def test_an_empty_scene_in_a_batch(windows):
     assert packed["scene"].tolist() == [1] * 20 and padded["mask"].sum(1).tolist() == [0, 20]
 
 
+@pytest.mark.thorough(context="spawn")
 @pytest.mark.parametrize("context", ["fork", "spawn"])
 def test_workers_yield_the_same_batches_in_the_same_order(path, windows, context):
     expected = list(itertools.islice(WindowStream(windows, 5, seed=3), 7))

@@ -14,6 +14,7 @@ def runs():
     return gripper, {friction: gripper.grasp(friction, dx=0.025, seconds=1.1) for friction in gripper.FRICTIONS}
 
 
+@pytest.mark.thorough
 def test_friction_lifts_the_cube(runs):
     """It hangs by its weight, or stays on the table."""
     gripper, (held, slipped) = runs[0], runs[1].values()
@@ -24,6 +25,7 @@ def test_friction_lifts_the_cube(runs):
     assert abs(slipped["lift"][-1]) < 0.05 * weight
 
 
+@pytest.mark.thorough
 def test_pictures(runs, tmp_path):
     pytest.importorskip("imageio_ffmpeg")
     gripper = runs[0]

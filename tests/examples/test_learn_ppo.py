@@ -21,6 +21,7 @@ def learn_ppo(monkeypatch) -> Any:
     return example("learn_ppo")
 
 
+@pytest.mark.thorough
 def test_push_is_learnt(learn_ppo, tmp_path, capsys):
     """In scenes that the training has not seen; the untrained network moves nothing. The file has the same network."""
     pytest.importorskip("matplotlib")

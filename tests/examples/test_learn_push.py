@@ -7,6 +7,7 @@ pytest.importorskip("gymnasium")
 pytestmark = pytest.mark.usefixtures("one_thread")  # as the script runs
 
 
+@pytest.mark.thorough
 def test_a_few_gradient_steps_raise_the_reward(tmp_path):
     """In scenes that the training has not seen; pushing on at the first speed moves the lumps half of the way."""
     pytest.importorskip("matplotlib")

@@ -7,6 +7,7 @@ pytest.importorskip("gymnasium")
 pytestmark = pytest.mark.usefixtures("one_thread")  # as the script runs
 
 
+@pytest.mark.thorough
 def test_gradients_improve_plans(tmp_path):
     """In 2-D and in 3-D; the picture of the cheaper ones alone."""
     pytest.importorskip("matplotlib")

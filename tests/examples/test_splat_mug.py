@@ -10,6 +10,7 @@ for package in ("pydantic", "h5py", "matplotlib", "PIL", "imageio_ffmpeg"):
     pytest.importorskip(package)
 
 
+@pytest.mark.thorough
 def test_the_mug_moves_in_all_scenes(device, tmp_path, capsys):
     pictures = example("splat_mug").main(tmp_path, device, count=400, frames=1, resolution=(48, 36))
     assert pictures.keys() == {"wobble", "melt", "pour"} and all(len(paths) == 2 for paths in pictures.values())

@@ -25,12 +25,14 @@ def test_network_on_the_grid_learns(capsys):
     assert last < 0.75 * first
 
 
+@pytest.mark.thorough
 def test_parameters_are_recovered(device, tmp_path, capsys):
     errors = example("recover_parameters").main(tmp_path, device, iterations=9)
     assert errors.keys() == {"E", "nu", "friction_angle"} and max(errors.values()) < 0.01
     assert drawn(tmp_path / "recover_parameters.png")
 
 
+@pytest.mark.thorough
 def test_stiffness_field_is_recovered(device, tmp_path, capsys):
     """The guess is off by 29%."""
     assert example("recover_stiffness_field").main(tmp_path, device, cells=12, iterations=25) < 0.03
@@ -68,6 +70,7 @@ def test_friction_is_learnt(device, tmp_path, capsys):
     assert drawn(tmp_path / "learn_friction.png")
 
 
+@pytest.mark.thorough
 def test_pictures_are_fitted(device, tmp_path, capsys):
     script = example("fit_images")
     script.STEPS = 200

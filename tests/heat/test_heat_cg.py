@@ -124,6 +124,7 @@ def test_float32(device, dim, kernel, far):
     assert relative_error(solve.increment, dense_increment(h)) < 1e-5
 
 
+@pytest.mark.thorough(dim=3)
 @pytest.mark.parametrize("boundaries", [False, True])
 def test_refinement(device, dim, boundaries):
     """float32 data, float64 accuracy; the gradient is that of the float64 solve."""

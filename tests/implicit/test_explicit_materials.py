@@ -68,6 +68,7 @@ def test_a_short_step_is_an_explicit_one(dim, stress_form, explicit, walls, devi
     assert 3.6 < differences[0] / differences[1] < 4.4
 
 
+@pytest.mark.thorough
 def test_first_order_in_dt(device):
     """After the same time in 16, 32 and 64 steps of each kind and in many explicit ones."""
     grid, state = beside(2, device)

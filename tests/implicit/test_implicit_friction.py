@@ -115,6 +115,7 @@ def test_friction_in_a_short_step_is_that_of_an_explicit_one(dim, device):
     assert 1.9 < differences[0] / differences[1] < 4.4
 
 
+@pytest.mark.thorough(dim=3)
 def test_a_belt_takes_the_block_along(dim, device):
     """A moving surface gives μ g until the block has its velocity."""
     grid, start = block(dim, device, lower=0.25)

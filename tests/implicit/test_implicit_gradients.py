@@ -65,6 +65,7 @@ def test_gradients_beside_an_obstacle(kind, device):
     )
 
 
+@pytest.mark.thorough
 def test_gradients_of_twenty_steps(device):
     grid, values = inputs(2, device)
     values["dt"] = values["dt"] / 4

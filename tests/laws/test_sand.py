@@ -814,6 +814,7 @@ def test_extreme_states_are_finite(device, dim, energy, dtype):
             assert bool(grad[moderate].isfinite().all())
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("level", ["baseline", "avx2"])
 def test_extreme_states_are_finite_with_every_instruction_set(level):
     """Rounding differs, and with it the branch of states on the boundary (a mean strain of some 1e-16)."""

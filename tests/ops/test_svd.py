@@ -183,6 +183,7 @@ def test_gradients_of_vectors_are_not_finite_where_values_are_equal(device, dim)
 # ---- registration and errors
 
 
+@pytest.mark.thorough(dim=3)
 def test_opcheck(device, dim):
     F = torch.randn(5, dim, dim, dtype=torch.float64, device=device, requires_grad=True)
     torch.library.opcheck(torch.ops.torch_mpm.svd3.default, (F,))

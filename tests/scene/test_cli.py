@@ -177,6 +177,7 @@ def test_without_pydantic_the_extra_is_named(scene):
     assert done.returncode == 1 and "pip install torch-mpm[scene]" in done.stderr
 
 
+@pytest.mark.thorough
 def test_ctrl_c_ends_after_a_whole_frame(tmp_path):
     path = tmp_path / "scene.toml"
     path.write_text(FILE.format(duration=600))

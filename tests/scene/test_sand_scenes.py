@@ -60,6 +60,7 @@ def test_heaps_stand_below_the_friction_angle_and_fail_above(device):
 # ---- in motion
 
 
+@pytest.mark.thorough
 def test_collapse_keeps_mass_and_loses_energy(device):
     result = collapse(Case("planar", 120), (1.0, 3.0), 4.0, device)
     wide, narrow = result["rows"]

@@ -200,7 +200,7 @@ def test_descriptions_reach_the_schema():
     assert "Young's modulus [Pa]" in text and "distance between grid nodes [m]" in text
 
 
-LARGE = ("sand_blade", "sand_cylinder", "hourglass")
+LARGE = ("sand_blade", "sand_cylinder", "hourglass", "sand_drum", "spinner")
 
 
 @pytest.mark.parametrize(

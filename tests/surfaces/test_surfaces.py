@@ -349,6 +349,7 @@ def test_two_styles_of_surfaces_are_refused(run, capsys):
     assert "render.surface: takes style = 'particles'" in capsys.readouterr().err
 
 
+@pytest.mark.thorough
 def test_surfaces_of_sand_alone_are_refused(tmp_path, capsys):
     path = tmp_path / "scene.toml"
     path.write_text(SAND)

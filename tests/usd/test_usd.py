@@ -292,6 +292,7 @@ def test_an_interrupted_file_leaves_nothing(run, tmp_path, monkeypatch, error):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.thorough
 def test_a_full_disk_is_reported_in_one_line(run, tmp_path):
     def small_disk():
         resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
