@@ -104,10 +104,11 @@ def cuda_wanted(native: bool) -> bool:
         raise SystemExit(f"TORCH_MPM_CUDA must be 0, 1, check or unset, got {choice!r}")
     if choice == "check" and not native:
         raise SystemExit("TORCH_MPM_CUDA=check compiles slow kernels, which no wheel may have: use 1, 0 or unset")
-    if choice in ("1", "check") and nvcc() is None:
+    required = choice in ("1", "check")
+    if required and nvcc() is None:
         raise SystemExit(f"TORCH_MPM_CUDA={choice}, but nvcc is neither in CUDA_HOME/bin nor in PATH")
     if choice or nvcc() is None:
-        return choice in ("1", "check")
+        return required
     if native and not gpu_present():
         print("The CUDA library is left out, since this machine has no GPU; TORCH_MPM_CUDA=1 builds it all the same.")
         return False

@@ -77,6 +77,14 @@ def held(step, *terms):
     return step
 
 
+def surface_and_nodes(dim):
+    """Arguments of `held`: an obstacle that holds a temperature at its surface, and one at the nodes in it."""
+    return [
+        (heat_boundaries.FixedSurface, bodies(dim)["sphere"], 40.0),
+        (heat_boundaries.Fixed, bodies(dim)["plane"], -5.0),
+    ]
+
+
 def terms(scenes=1, particles=0):
     """Terms of boundaries at the free surface and inside, by name."""
     surface = heat_boundaries.FreeSurface()

@@ -5,7 +5,20 @@ import warnings
 
 import pytest
 import torch
-from heat_scenes import DT, LAWS, SOFTENING, THERMAL, TRANSFERS, bodies, composed, held, scene, terms, thermal
+from heat_scenes import (
+    DT,
+    LAWS,
+    SOFTENING,
+    THERMAL,
+    TRANSFERS,
+    bodies,
+    composed,
+    held,
+    scene,
+    surface_and_nodes,
+    terms,
+    thermal,
+)
 from helpers import relative_error
 from pairs import in_pairs
 
@@ -156,8 +169,7 @@ def test_deterministic_grids_repeat_the_heat(dim, device):
     ends = []
     for _ in range(2):
         step, state = scene(dim, torch.float32, melts=True, deterministic=True, device=device)
-        region, plate = bodies(dim)["sphere"], bodies(dim)["plane"]
-        step = held(step, (heat_boundaries.FixedSurface, region, 40.0), (heat_boundaries.Fixed, plate, -5.0))
+        step = held(step, *surface_and_nodes(dim))
         step.heat.boundaries = [*step.heat.boundaries.entries, *terms()["convection"]]
         with torch.no_grad():
             ends.append(mpm.rollout(step, state, 40, DT))
@@ -225,8 +237,7 @@ def test_free_surface_and_sources(dim, name, with_held, device):
     chosen = [t for own in terms().values() for t in own] if name == "all" else terms()[name]
     step.heat.boundaries = chosen
     if with_held:
-        region, plate = bodies(dim)["sphere"], bodies(dim)["plane"]
-        step = held(step, (heat_boundaries.FixedSurface, region, 40.0), (heat_boundaries.Fixed, plate, -5.0))
+        step = held(step, *surface_and_nodes(dim))
         step.heat.boundaries = [*chosen, *step.heat.boundaries.entries]
     end = compare(step, state, 6)
     step.heat.boundaries = [b for b in step.heat.boundaries.entries if b not in chosen]
@@ -244,8 +255,8 @@ def test_free_surface_and_sources_of_scenes(per_particle, device):
 
 @pytest.mark.parametrize("seed", range(32))
 def test_float32_with_boundaries(seed, device):
-    """Boundaries, transfers, and solves of one to three simple steps or by conjugate gradients; on CUDA these have one
-    kernel, for one or several items of a block."""
+    """Boundaries, transfers, and solves of one to three simple steps or by conjugate gradients, with one or several
+    items of a block on CUDA."""
     r = random.Random(seed)
     dim, scenes = r.choice((2, 3)), r.choice((1, 3))
     per_cell = r.choice((2**dim, 40 if dim == 2 else 20))
@@ -259,9 +270,8 @@ def test_float32_with_boundaries(seed, device):
     step.heat.reference = 290.0
     free = terms(scenes)
     chosen = r.choice(([], *free.values(), [term for own in free.values() for term in own]))
-    region, plate = bodies(dim)["sphere"], bodies(dim)["plane"]
-    kinds = [(heat_boundaries.FixedSurface, region, 40.0), (heat_boundaries.Fixed, plate, -5.0)]
-    step = held(step, *r.choice(([], kinds[:1], kinds[1:], kinds)))
+    both = surface_and_nodes(dim)
+    step = held(step, *r.choice(([], both[:1], both[1:], both)))
     step.heat.boundaries = [*chosen, *step.heat.boundaries.entries]
     x = state.x.clone()
     x[3] = 5.0  # outside
@@ -270,7 +280,7 @@ def test_float32_with_boundaries(seed, device):
 
 
 def test_many_particles_in_float32(device):
-    """More than one kernel of heat holds at once on CUDA."""
+    """More than those whose P2G runs beside the solve of the substep before on CUDA."""
     compare(*scene(3, torch.float32, melts=True, per_cell=14**3, device=device), n=5, tolerance=1e-3)
 
 
