@@ -62,6 +62,8 @@ def environment(device: str = "cpu", devices: int = 1) -> dict[str, Any]:
     }
     if torch.device(device).type == "cuda":
         place["cuda"] = torch.version.cuda
+        if "--Ofast-compile=max" in build["build"].get("cuda", {}).get("flags", []):
+            place["kernels"] = "compiled for a check, slow"
     else:
         place["threads"] = torch.get_num_threads()
         place["instructions"] = torch.backends.cpu.get_cpu_capability()

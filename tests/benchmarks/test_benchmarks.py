@@ -311,3 +311,10 @@ def test_memory_of_checkpoints_is_what_was_estimated() -> None:
     for name in ("all steps", "5 states"):
         case = checkpoints.case("torch code", name, 4, 20, "cpu")
         assert 0.6 * case["estimated_memory"] < case["memory"] <= case["estimated_memory"]
+
+
+@pytest.mark.parametrize("flags", [["-O3"], ["-O3", "--Ofast-compile=max"]])
+def test_slow_kernels_of_a_check_are_named(flags, monkeypatch):
+    monkeypatch.setattr("torch_mpm.info.info", lambda: {"version": "1", "build": {"cuda": {"flags": flags}}})
+    monkeypatch.setattr(common, "device_name", str)
+    assert ("kernels" in common.environment("cuda")) == (len(flags) == 2)
