@@ -155,8 +155,7 @@ def test_few_particles_leave_their_blocks_at_once(dim, dtype, n, device):
 @pytest.mark.parametrize("few", [1, 8, 9, 32])
 @pytest.mark.parametrize("kernel", ["quadratic", "cubic"])
 def test_numbers_of_particles_that_leave_a_block(kernel, few, device):
-    """In simple steps in float32, whose kernels on CUDA have a warp for the first eight of them. A particle that does
-    not conduct changes a temperature by 2e-4 of the largest one."""
+    """In simple steps in float32. A particle that does not conduct changes a temperature by 2e-4 of the largest one."""
     ends = []
     for dtype in (torch.float32, torch.float64):
         step, state = scene(3, dtype, max_blocks=27, kernel=kernel, device=device)
