@@ -10,6 +10,7 @@ import pytest
 import torch
 from helpers import result, run_quick, run_quick_here
 
+import setup
 from benchmarks import common, report
 from benchmarks.accuracy import convergence, manufactured, ritter
 from benchmarks.speed import bodies_newton, checkpoints, peers, splats, step, work
@@ -313,7 +314,7 @@ def test_memory_of_checkpoints_is_what_was_estimated() -> None:
         assert 0.6 * case["estimated_memory"] < case["memory"] <= case["estimated_memory"]
 
 
-@pytest.mark.parametrize("flags", [["-O3"], ["-O3", "--Ofast-compile=max"]])
+@pytest.mark.parametrize("flags", [["-O3"], ["-O3", setup.NVCC_FAST_COMPILE]])
 def test_slow_kernels_of_a_check_are_named(flags, monkeypatch):
     monkeypatch.setattr("torch_mpm.info.info", lambda: {"version": "1", "build": {"cuda": {"flags": flags}}})
     monkeypatch.setattr(common, "device_name", str)
