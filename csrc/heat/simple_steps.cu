@@ -269,60 +269,83 @@ __device__ Vec4<T> sum_of_warps(const T (*sums)[N], int at) {
   return sum;
 }
 
+// Number of particles out of the base block of an item that another thread block adds, where several warps share an
+// item: a chain of loads leads to the nodes of each, which takes as long as the product of the others.
+template <bool InOrder, int Warps>
+constexpr int kApart = !InOrder && Warps > 1 ? 8 : 0;
+
 // Least number of thread blocks of a multiprocessor; of many items as many threads as in csrc/heat/heat.cu.
 template <int Warps, int Order, class T>
 constexpr int kProductBlocks = Order != 2 || sizeof(T) != 4 ? 2
                                : Warps == 1                 ? 5
                                                             : 4;
 
+// Barrier of the warps that share an item.
+template <int Warps>
+__device__ void wait_for_warps() {
+  Warps == 1 ? __syncwarp() : __syncthreads();
+}
+
+// Product of the particles of item i that are in their base block, by `Warps` warps.
+template <bool InOrder, int Warps, int Order, class T, int D>
+__device__ void multiply_in_block(const SimpleKernel<Order, T, D>& k, int i, const Item& item, int warp,
+                                  const Directions<T, D>& directions, T* values,
+                                  T (*sums)[HeatShape<Order, T, D>::tile]) {
+  using S = HeatShape<Order, T, D>;
+  const TileQuads<S, 32 * Warps> quads(k.topology(), item.slot);
+  with_values(k.a, directions, [&](const auto& u) {
+    Vec4<T> loaded[quads.rounds];
+#pragma unroll
+    for (int r = 0; r < quads.rounds; r++) loaded[r] = quads.node[r] < 0 ? Vec4<T>{} : u.at(quads.node[r]);
+#pragma unroll
+    for (int r = 0; r < quads.rounds; r++)
+      if (quads.in_tile(r)) store_vec4(values + quads.at[r], loaded[r]);
+  });
+  for (int n = lane_index(); n < S::tile / 4; n += 32) store_vec4(sums[warp] + 4 * n, Vec4<T>{});
+  wait_for_warps<Warps>();
+  const int end = InOrder ? k.topology().offsets[item.slot + 1] : item.end;
+  for (int number = i, begin = item.begin; begin < end; begin = k.item(number++).end)
+    sum_cells<HeatSum::product, S, Warps>(LaneCounts<S>(k.packed.counts + int64_t(number) * S::cells),
+                                          k.packed.particles + begin, warp, values, sums[warp]);
+  wait_for_warps<Warps>();
+#pragma unroll
+  for (int r = 0; r < quads.rounds; r++) {
+    if (!quads.in_tile(r) || (!InOrder && quads.node[r] < 0)) continue;
+    const Vec4<T> sum = sum_of_warps<Warps>(sums, quads.at[r]);
+    if (InOrder)
+      store_vec4(k.packed.tiles + int64_t(item.slot) * k.packed.kTile + quads.at[r], sum);
+    else if (!is_zero(sum))
+      add_quad(k.product() + quads.node[r], sum);
+  }
+  wait_for_warps<Warps>();
+}
+
 // One or several warps for each item share the nodes, and the particles of each cell. `InOrder`: for each base block,
-// with all of its items.
+// with all of its items. The first `blocks` thread blocks process the items; those after them, a warp for each item,
+// the particles that are apart.
 template <bool InOrder, int Warps, int Order, class T, int D>
 __global__ void __launch_bounds__(kProductThreads, kProductBlocks<Warps, Order, T>)
-    product_kernel(const __grid_constant__ SimpleKernel<Order, T, D> k) {
+    product_kernel(const __grid_constant__ SimpleKernel<Order, T, D> k, int blocks) {
   using S = typename SimpleKernel<Order, T, D>::S;
-  using Quads = TileQuads<S, 32 * Warps>;
-  constexpr int together = kProductWarps / Warps;  // items of a thread block
+  constexpr int together = kProductWarps / Warps,
+                apart = kApart<InOrder, Warps>;  // `together`: items of a thread block
   grid_dependency_sync();
   __shared__ alignas(16) T values_of_items[together][S::tile];
   __shared__ alignas(16) T sums_of_warps[kProductWarps][S::tile];
-  const int warp = int(threadIdx.x) / 32 % Warps, own = int(threadIdx.x) / 32 / Warps;
-  T* const values = values_of_items[own];
-  T(*const sums)[S::tile] = sums_of_warps + own * Warps;
-  const auto sync = [] { Warps == 1 ? __syncwarp() : __syncthreads(); };
-  for_items_of_step(
-      k, int(blockIdx.x) * together + own, int(gridDim.x) * together,
-      [&](int i, const Item& item, int scene, const Directions<T, D>& directions) {
-        if (InOrder && item.begin != k.topology().offsets[item.slot]) return;
-        const Quads quads(k.topology(), item.slot);
-        with_values(k.a, directions, [&](const auto& u) {
-          Vec4<T> loaded[Quads::rounds];
-#pragma unroll
-          for (int r = 0; r < quads.rounds; r++) loaded[r] = quads.node[r] < 0 ? Vec4<T>{} : u.at(quads.node[r]);
-#pragma unroll
-          for (int r = 0; r < quads.rounds; r++)
-            if (quads.in_tile(r)) store_vec4(values + quads.at[r], loaded[r]);
-        });
-        for (int n = lane_index(); n < S::tile / 4; n += 32) store_vec4(sums[warp] + 4 * n, Vec4<T>{});
-        sync();
-        const int end = InOrder ? k.topology().offsets[item.slot + 1] : item.end;
-        for (int number = i, begin = item.begin; begin < end; begin = k.item(number++).end)
-          sum_cells<HeatSum::product, S, Warps>(LaneCounts<S>(k.packed.counts + int64_t(number) * S::cells),
-                                                k.packed.particles + begin, warp, values, sums[warp]);
-        sync();
-#pragma unroll
-        for (int r = 0; r < quads.rounds; r++) {
-          if (!quads.in_tile(r) || (!InOrder && quads.node[r] < 0)) continue;
-          const Vec4<T> sum = sum_of_warps<Warps>(sums, quads.at[r]);
-          if (InOrder)
-            store_vec4(k.packed.tiles + int64_t(item.slot) * k.packed.kTile + quads.at[r], sum);
-          else if (!is_zero(sum))
-            add_quad(k.product() + quads.node[r], sum);
-        }
-        if (!InOrder)
-          add_out_of_block(k, item.begin + count_in_block<S>(k.packed, i) + warp, item.end, Warps, scene, directions);
-        sync();
-      });
+  const int number = int(threadIdx.x) / 32, warp = number % Warps, own = number / Warps;
+  const bool is_apart = apart > 0 && int(blockIdx.x) >= blocks;
+  const int first = is_apart ? (int(blockIdx.x) - blocks) * kProductWarps + number : int(blockIdx.x) * together + own,
+            stride = is_apart ? (int(gridDim.x) - blocks) * kProductWarps : blocks * together;
+  for_items_of_step(k, first, stride, [&](int i, const Item& item, int scene, const Directions<T, D>& directions) {
+    if (InOrder && item.begin != k.topology().offsets[item.slot]) return;
+    if (!is_apart)
+      multiply_in_block<InOrder, Warps>(k, i, item, warp, directions, values_of_items[own],
+                                        sums_of_warps + own * Warps);
+    if (InOrder) return;
+    const int out = item.begin + count_in_block<S>(k.packed, i), rest = out + apart;
+    add_out_of_block(k, is_apart ? out : rest + warp, is_apart ? ::min(rest, item.end) : item.end, is_apart ? 1 : Warps,
+                     scene, directions);
+  });
 }
 
 // The product at four nodes of a row of a block from the tiles that have them.
@@ -356,10 +379,12 @@ template <bool InOrder, int Warps, int Order, class T, int D>
 void multiply(const SimpleKernel<Order, T, D>& kernel, int64_t items, Stream stream) {
   constexpr int together = kProductWarps / Warps;
   // Most scenes need no third step, and then each thread block costs time.
-  const int64_t few = int64_t(device_attribute(cudaDevAttrMultiProcessorCount)) * 8;
-  const int64_t blocks = (items + together - 1) / together;
-  launch_in_chain(product_kernel<InOrder, Warps, Order, T, D>,
-                  grid_size(kernel.a.step < 2 ? blocks : std::min(blocks, few)), kProductThreads, 0, stream, kernel);
+  const int64_t few = int64_t(device_attribute(cudaDevAttrMultiProcessorCount)) * 8,
+                all = (items + together - 1) / together;
+  const unsigned blocks = grid_size(kernel.a.step < 2 ? all : std::min(all, few)),
+                 apart = kApart<InOrder, Warps> > 0 ? (blocks + kProductWarps - 1) / kProductWarps : 0;
+  launch_in_chain(product_kernel<InOrder, Warps, Order, T, D>, blocks + apart, kProductThreads, 0, stream, kernel,
+                  int(blocks));
 }
 
 }  // namespace
