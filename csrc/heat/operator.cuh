@@ -128,45 +128,69 @@ struct LaneCounts {
   }
 };
 
-// Calls begin(cell, whether there are particles), each(particle) and end(cell) for the cells of an item, a warp's width
-// of them at a time. All lanes take part, with a non-conducting particle where they have none. Of several warps that
-// share an item, each processes the rows of the packed order from its number on, every `Warps`-th.
-template <class S, int Warps, class T, int D, class Begin, class Each, class End>
-__device__ void walk_cells(const LaneCounts<S>& counts, const PackedParticle<T, D>* particles, int warp,
-                           const Begin& begin, const Each& each, const End& end) {
-  const int lane = lane_index();
-  const unsigned before = (1u << lane) - 1;
-#pragma unroll 1
-  for (int part = 0; part < S::parts; part++) {
-    const int cell = part * 32 + lane % (32 / S::slices);
-    const int mine = part == 0 ? counts.of_part[0] : counts.of_part[S::parts - 1];
-    const PackedParticle<T, D>* const of_next_part = Warps == 1 ? nullptr : particles + __reduce_add_sync(~0u, mine);
-    int row = 0;
-    const auto skip_row = [&] { particles += __popc(__ballot_sync(~0u, mine > row++)); };
-    while (Warps > 1 && row < warp) skip_row();
-    bool has = mine > row;
-    unsigned lanes = __ballot_sync(~0u, has);
-    PackedParticle<T, D> next{};
-    if (has) next = load_once(particles + __popc(lanes & before));
-    if (lanes) begin(cell, has);
-    const bool some = lanes != 0;
-#pragma unroll 1
-    while (lanes) {
-      PackedParticle<T, D> now = next;
-      if (!has) now.conductance = T(0);
-      particles += __popc(lanes);
-      row++;
-#pragma unroll
-      for (int other = 1; other < Warps; other++) skip_row();
-      has = mine > row;
-      lanes = __ballot_sync(~0u, has);
-      if (has) next = load_once(particles + __popc(lanes & before));
-      each(now);
-    }
-    if (some) end(cell);
-    if (Warps > 1) particles = of_next_part;
+// A walk over the cells of an item, one part of them at a time, as wide as a warp. All lanes take part, with a
+// non-conducting particle where they have none. Of several warps that share an item, each processes only one part, and
+// those of the same part every `share`-th row of its packed order. The first particles are loaded at once.
+template <class S, int Warps, class T, int D>
+class CellWalk {
+  static_assert(Warps == 1 || Warps % S::parts == 0);
+  static constexpr int share = Warps == 1 ? 1 : Warps / S::parts;  // warps of a part
+
+ public:
+  __device__ CellWalk(const LaneCounts<S>& counts, const PackedParticle<T, D>* particles, int warp)
+      : counts_(counts), particles_(particles) {
+    if (Warps > 1)
+      for (; part_ < warp % S::parts; part_++) particles_ += __reduce_add_sync(~0u, counts_.of_part[part_]);
+    start_part(warp / S::parts);
   }
-}
+
+  // Calls begin(cell, whether there are particles), each(particle) and end(cell) for the cells.
+  template <class Begin, class Each, class End>
+  __device__ void run(const Begin& begin, const Each& each, const End& end) {
+#pragma unroll 1
+    while (true) {
+      const int cell = part_ * 32 + lane_index() % (32 / S::slices);
+      if (lanes_) begin(cell, has_);
+      const bool some = lanes_ != 0;
+#pragma unroll 1
+      while (lanes_) {
+        PackedParticle<T, D> now = next_;
+        if (!has_) now.conductance = T(0);
+        particles_ += __popc(lanes_);
+        row_++;
+#pragma unroll
+        for (int other = 1; other < share; other++) skip_row();
+        load();
+        each(now);
+      }
+      if (some) end(cell);
+      if (Warps > 1 || ++part_ == S::parts) return;
+      start_part(0);
+    }
+  }
+
+ private:
+  LaneCounts<S> counts_;
+  const PackedParticle<T, D>* particles_;
+  int part_ = 0, mine_ = 0, row_ = 0;
+  bool has_ = false;
+  unsigned lanes_ = 0;
+  PackedParticle<T, D> next_{};
+
+  __device__ void skip_row() { particles_ += __popc(__ballot_sync(~0u, mine_ > row_++)); }
+  __device__ void load() {
+    has_ = mine_ > row_;
+    lanes_ = __ballot_sync(~0u, has_);
+    if (has_) next_ = load_once(particles_ + __popc(lanes_ & ((1u << lane_index()) - 1)));
+  }
+  __device__ void start_part(int row) {
+    mine_ = part_ == 0 ? counts_.of_part[0] : counts_.of_part[S::parts - 1];
+    row_ = 0;
+    if (Warps > 1)
+      while (row_ < row) skip_row();
+    load();
+  }
+};
 
 // Makes the rows for the counts of the cells, by one warp.
 template <class S, int Most>
@@ -185,7 +209,7 @@ __device__ void set_rows(PackedOrder<S, Most>& m) {
   }
 }
 
-// Packs the particles of an item in the order of `walk_cells`.
+// Packs the particles of an item in the order of a walk.
 template <class S, class T, int D>
 __device__ void pack_item(const Topology<T, D>& t, const Columns<const T, D>& x, const Columns<const T, 1>& conductance,
                           const Item& item, int number, const PackedItems<T, D>& packed, WarpMemory<S>& memory) {
@@ -318,14 +342,12 @@ struct StartValues {
   }
 };
 
-// Adds the cells of an item to the sums of a tile; u are the values of its nodes. Of several warps that share the item,
+// Adds the cells of a walk to the sums of a tile; u are the values of its nodes. Of several warps that share the item,
 // each has sums of its own. Returns what the particles of this lane add to Σ κ V |∇u|².
 template <HeatSum Sum, class S, int Warps, class T, int D>
-__device__ T sum_cells(const LaneCounts<S>& counts, const PackedParticle<T, D>* particles, int warp, const T* u,
-                       T* sum) {
+__device__ T sum_cells(CellWalk<S, Warps, T, D> walk, const T* u, T* sum) {
   T from[S::nodes], to[S::nodes], power = T(0);
-  walk_cells<S, Warps>(
-      counts, particles, warp,
+  walk.run(
       [&](int cell, bool some) {
         for_support<S>(cell, [&](int k, int i) {
           if (Sum == HeatSum::product) from[k] = some ? u[i] : T(0);  // u may be NaN away from the particles
@@ -372,7 +394,7 @@ __device__ T sum_items(const Topology<T, D>& t, const PackedItems<T, D>& packed,
   T power = T(0);
 #pragma unroll 1
   while (true) {
-    power += sum_cells<Sum, S, 1>(counts, packed.particles + items[number].begin, 0, m.u, m.sum);
+    power += sum_cells<Sum>(CellWalk<S, 1, T, D>(counts, packed.particles + items[number].begin, 0), m.u, m.sum);
     if (++number >= end) break;
     counts = LaneCounts<S>(packed.counts + int64_t(number) * S::cells);
   }

@@ -106,10 +106,22 @@ struct Directions {
   __device__ Directions(const HeatSimpleArguments<T, D>& a, int scene, int steps)
       : a(a), steps(steps), c(bound_of_scene(a.solve, scene)), dt(step_of_scene(a.solve, scene)) {}
   __device__ T of(int64_t node) const { return simple_direction(a, node, steps, c, dt); }
+  // Those of four nodes of a row, whose inputs are loaded together.
   __device__ Vec4<T> at(int node) const {
-    Vec4<T> u;
+    const HeatArguments<T, D>& s = a.solve;
+    Vec4<T> product[kMostSimpleSteps - 1]{}, u;
+    NodeInputs<T> in[kBlockWidth];
 #pragma unroll
-    for (int k = 0; k < kBlockWidth; k++) u.e[k] = of(node + k);
+    for (int j = 0; j < kMostSimpleSteps - 1; j++)
+      if (j < a.step) product[j] = load_vec4(a.product[j] + node);
+#pragma unroll
+    for (int k = 0; k < kBlockWidth; k++) in[k] = node_inputs(s, node + k);
+#pragma unroll
+    for (int k = 0; k < kBlockWidth; k++) {
+      const T at_start = product[0].e[k], after_first = product[1].e[k];
+      u.e[k] = simple_direction(
+          simple_node(in[k], steps, a.step - 1, c, dt, [=](int j) { return j == 0 ? at_start : after_first; }));
+    }
     return u;
   }
 };
@@ -286,27 +298,47 @@ __device__ void wait_for_warps() {
   Warps == 1 ? __syncwarp() : __syncthreads();
 }
 
-// Product of the particles of item i that are in their base block, by `Warps` warps.
-template <bool InOrder, int Warps, int Order, class T, int D>
-__device__ void multiply_in_block(const SimpleKernel<Order, T, D>& k, int i, const Item& item, int warp,
-                                  const Directions<T, D>& directions, T* values,
-                                  T (*sums)[HeatShape<Order, T, D>::tile]) {
-  using S = HeatShape<Order, T, D>;
-  const TileQuads<S, 32 * Warps> quads(k.topology(), item.slot);
-  with_values(k.a, directions, [&](const auto& u) {
-    Vec4<T> loaded[quads.rounds];
+// Loads the values u of the nodes of a tile.
+template <class Quads, class T, int D>
+__device__ void load_values(const HeatSimpleArguments<T, D>& a, const Directions<T, D>& directions, const Quads& quads,
+                            T* values) {
+  with_values(a, directions, [&](const auto& u) {
+    Vec4<T> loaded[Quads::rounds];
 #pragma unroll
     for (int r = 0; r < quads.rounds; r++) loaded[r] = quads.node[r] < 0 ? Vec4<T>{} : u.at(quads.node[r]);
 #pragma unroll
     for (int r = 0; r < quads.rounds; r++)
       if (quads.in_tile(r)) store_vec4(values + quads.at[r], loaded[r]);
   });
-  for (int n = lane_index(); n < S::tile / 4; n += 32) store_vec4(sums[warp] + 4 * n, Vec4<T>{});
-  wait_for_warps<Warps>();
-  const int end = InOrder ? k.topology().offsets[item.slot + 1] : item.end;
-  for (int number = i, begin = item.begin; begin < end; begin = k.item(number++).end)
-    sum_cells<HeatSum::product, S, Warps>(LaneCounts<S>(k.packed.counts + int64_t(number) * S::cells),
-                                          k.packed.particles + begin, warp, values, sums[warp]);
+}
+
+// Product of the particles of item i that are in their base block, by `Warps` warps.
+template <bool InOrder, int Warps, int Order, class T, int D>
+__device__ void multiply_in_block(const SimpleKernel<Order, T, D>& k, int i, const Item& item, int warp,
+                                  const Directions<T, D>& directions, T* values,
+                                  T (*sums)[HeatShape<Order, T, D>::tile]) {
+  using S = HeatShape<Order, T, D>;
+  const auto walk_of = [&](int number, int begin) {
+    const LaneCounts<S> counts(k.packed.counts + int64_t(number) * S::cells);
+    return CellWalk<S, Warps, T, D>(counts, k.packed.particles + begin, warp);
+  };
+  const TileQuads<S, 32 * Warps> quads(k.topology(), item.slot);
+  const auto load = [&] {
+    load_values(k.a, directions, quads, values);
+    for (int n = lane_index(); n < S::tile / 4; n += 32) store_vec4(sums[warp] + 4 * n, Vec4<T>{});
+    wait_for_warps<Warps>();
+  };
+  // Of few items, whose warps do not hide the loads of each other, the first particles are loaded beside the nodes.
+  if constexpr (Warps > 1) {
+    const CellWalk<S, Warps, T, D> walk = walk_of(i, item.begin);
+    load();
+    sum_cells<HeatSum::product>(walk, values, sums[warp]);
+  } else {
+    load();
+    const int end = InOrder ? k.topology().offsets[item.slot + 1] : item.end;
+    for (int number = i, begin = item.begin; begin < end; begin = k.item(number++).end)
+      sum_cells<HeatSum::product>(walk_of(number, begin), values, sums[warp]);
+  }
   wait_for_warps<Warps>();
 #pragma unroll
   for (int r = 0; r < quads.rounds; r++) {

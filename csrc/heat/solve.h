@@ -224,6 +224,19 @@ MPM_HD T theta_at(const HeatArguments<T, D>& a, int64_t row) {
   return mean_of(a.sums[row * kHeatChannels + kHeatTheta], capacity_at(a, row));
 }
 
+// What the equation of a node reads.
+template <class T>
+struct NodeInputs {
+  T capacity, exchange, source, theta;  // zero where absent
+  bool fixed;
+};
+
+template <class T, int D>
+MPM_HD NodeInputs<T> node_inputs(const HeatArguments<T, D>& a, int64_t row) {
+  return {capacity_at(a, row), a.exchange ? a.exchange[row] : T(0), a.source ? a.source[row * a.source_stride] : T(0),
+          a.exchange && has_theta(a) ? theta_at(a, row) : T(0), a.fixed && a.fixed[row]};
+}
+
 // The equation of a node at the start, where `product` is H θ. Nodes that are not free have no weight and no residual.
 template <class T>
 struct NodeEquation {
@@ -231,16 +244,13 @@ struct NodeEquation {
   T mass, source, weight, residual;
 };
 
-template <class T, int D>
-MPM_HD NodeEquation<T> node_equation(const HeatArguments<T, D>& a, int64_t row, const T& product, double dt) {
-  const T mass = capacity_at(a, row), exchange = a.exchange ? a.exchange[row] : T(0);
-  const bool material = !(mass <= T(0)), held = material && a.fixed && a.fixed[row], free = material && !held;
-  NodeEquation<T> e{free, held || (free && exchange != T(0)), mass, T(0), T(0), T(0)};
-  if (a.source) e.source = a.source[row * a.source_stride];
+template <class T>
+MPM_HD NodeEquation<T> node_equation(const NodeInputs<T>& in, const T& product, double dt) {
+  const bool material = !(in.capacity <= T(0)), held = material && in.fixed, free = material && !held;
+  NodeEquation<T> e{free, held || (free && in.exchange != T(0)), in.capacity, in.source, T(0), T(0)};
   if (!free) return e;
-  e.weight = mass / T(dt) + exchange;
-  e.residual = e.source - product;
-  if (a.exchange && has_theta(a)) e.residual -= exchange * theta_at(a, row);
+  e.weight = in.capacity / T(dt) + in.exchange;
+  e.residual = in.source - product - in.exchange * in.theta;
   return e;
 }
 
@@ -252,7 +262,7 @@ MPM_HD StartSums<T> start_node(const HeatArguments<T, D>& a, const HeatVectors<T
   const T product = v.product[i], diagonal = v.inverse[i], bound = v.weight[i];
   v.p[i] = v.product[i] = v.mass[i] = v.weight[i] = v.inverse[i] = v.r[i] = T(0);
   if (!used) return sums;
-  const NodeEquation<T> e = node_equation(a, row, product, dt);
+  const NodeEquation<T> e = node_equation(node_inputs(a, row), product, dt);
   sums.open = e.open;
   if (!e.free) return sums;
   const T inverse = T(1) / (a.method == HeatMethod::chebyshev ? e.weight : e.weight + diagonal);
@@ -285,27 +295,32 @@ MPM_HD void take_simple_steps(SimpleNode<P>& n, int steps, int k, double c, cons
   }
 }
 
-template <class T, int D>
-MPM_HD SimpleNode<T> simple_node(const HeatSimpleArguments<T, D>& a, int64_t row, int steps, int k, double c,
-                                 double dt) {
-  const NodeEquation<T> e = node_equation(a.solve, row, a.product[0][row], dt);
+// The same for a node, where product(0) is H θ.
+template <class T, class F>
+MPM_HD SimpleNode<T> simple_node(const NodeInputs<T>& in, int steps, int k, double c, double dt, const F& product) {
+  const NodeEquation<T> e = node_equation(in, product(0), dt);
   SimpleNode<T> n{e.residual, T(0), e.weight};
-  if (e.free) take_simple_steps<T>(n, steps, k, c, [&](int j) { return a.product[j][row]; });
+  if (e.free) take_simple_steps<T>(n, steps, k, c, product);
   return n;
 }
 
-// The values u of a product H u of the simple steps.
+// The values u of a product H u of the simple steps, after the first one.
+template <class T>
+MPM_HD T simple_direction(const SimpleNode<T>& n) {
+  return n.weight == T(0) ? T(0) : n.residual / n.weight;
+}
 template <class T, int D>
 MPM_HD T simple_direction(const HeatSimpleArguments<T, D>& a, int64_t row, int steps, double c, double dt) {
   if (a.step == 0) return theta_at(a.solve, row);
-  const SimpleNode<T> n = simple_node(a, row, steps, a.step - 1, c, dt);
-  return n.weight == T(0) ? T(0) : n.residual / n.weight;
+  return simple_direction(
+      simple_node(node_inputs(a.solve, row), steps, a.step - 1, c, dt, [&](int j) { return a.product[j][row]; }));
 }
 
 // The increment of a node after these steps.
 template <class T, int D>
 MPM_HD T simple_increment(const HeatSimpleArguments<T, D>& a, int64_t row, int steps, double c, double dt) {
-  return simple_node(a, row, steps, steps, c, dt).increment;
+  return simple_node(node_inputs(a.solve, row), steps, steps, c, dt, [&](int j) { return a.product[j][row]; })
+      .increment;
 }
 
 // Next direction; returns the part of p · A p without H.
