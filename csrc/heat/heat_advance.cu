@@ -144,24 +144,47 @@ struct AdvanceItem {
     __syncthreads();
   }
 
+  // Some particles at a time, whose nodes are in shared memory then: a thread would wait for one node after another.
   __device__ void process_out_of_block() {
-    const Schedule<const int> schedule = schedule_of(topology());
+    constexpr int together = AdvanceMemory<K>::nodes / kSupportNodes<Order, D>;
+    const OutOfBlockList<S::batch>& list = m.scatter.out_of_block;
 #pragma unroll 1
-    for (int s = threadIdx.x; s < m.scatter.out_of_block.count; s += threads) {
-      const int i = m.scatter.out_of_block.particle[s], p = particle(i);
-      GridSupport<T, D, D, K::quads> support{k.motion.nodes};
-      T f[D];
-      const Vector<T, D> x = read_vector(k.heat.position, p);
-      const int at = locate_slot<Order>(topology(), scene(), x, support.base, f);
-      if (at < 0) {
-        k.skip(p);
-        m.packed[i] = {};
-        continue;
-      }
-      for (int b = 0; b < 1 << D; b++) support.set_slot(b, schedule.neighbours[(at << D) + b]);
-      finish(i, p, f, k.load(p, scene()), k.motion.compute(Weights<Order, T, D>(f), support));
+    for (int first = 0; first < list.count; first += together) {
+      const int number = ::min(together, list.count - first);
+      for (int s = threadIdx.x / 32; s < number; s += threads / 32)
+        copy_support(particle(list.particle[first + s]), m.velocities + s * kSupportNodes<Order, D>);
+      __syncthreads();
+      if (threadIdx.x < number)
+        process_out_of_block(list.particle[first + threadIdx.x], m.velocities + threadIdx.x * kSupportNodes<Order, D>);
+      __syncthreads();
     }
-    __syncthreads();
+  }
+
+  // Copies the nodes of a particle's support, by a warp.
+  __device__ void copy_support(int p, NodeValue<T, D>* to) const {
+    int base[D];
+    T f[D];
+    const int slot = locate_slot<Order>(topology(), scene(), read_vector(k.heat.position, p), base, f);
+    if (slot < 0) return;
+    for (int n = lane_index(); n < kSupportNodes<Order, D>; n += 32) {
+      int node[D];
+#pragma unroll
+      for (int i = D - 1, rest = n; i >= 0; i--, rest /= Order + 1) node[i] = base[i] + rest % (Order + 1);
+      to[n] = load_near<K::quads, D>(k.motion.nodes, schedule_of(topology()).neighbours + (int64_t(slot) << D), node);
+    }
+  }
+
+  __device__ void process_out_of_block(int i, const NodeValue<T, D>* nodes) {
+    const int p = particle(i);
+    int base[D];
+    T f[D];
+    if (locate_slot<Order>(topology(), scene(), read_vector(k.heat.position, p), base, f) < 0) {
+      k.skip(p);
+      m.packed[i] = {};
+      return;
+    }
+    const TileSupport<Order, T, D, Order + 1> support{nodes};
+    finish(i, p, f, k.load(p, scene()), k.motion.compute(Weights<Order, T, D>(f), support));
   }
 
   // Copies the packed particles into the order of the products.

@@ -118,10 +118,10 @@ struct alignas(K == 1   ? sizeof(T)
   T e[K == 3 ? 4 : K];
 };
 
-// Nodes in shared memory: those of the base block and the next Order along each axis.
-template <int Order, class T, int K>
+// Nodes in shared memory: those of the base block and the next Order along each axis, or a cube of another width.
+template <int Order, class T, int K, int Width = kBlockWidth + Order>
 struct TileSupport {
-  static constexpr int blocks = 1, width = kBlockWidth + Order;
+  static constexpr int blocks = 1, width = Width;
   const NodeValue<T, K>* corner;  // the base node
   BlockRows<1> rows;
 
@@ -402,24 +402,30 @@ __device__ void gather_in_memory_order(const Task& task, const Schedule<const in
   }
 }
 
+// Channels of a node, counted from the first one of a base block; `slots` are those of the block and its neighbours.
+// Zero where a block is not active.
+template <bool Quads, int K, class T, int D>
+__device__ NodeValue<T, K> load_near(const NodeField<const T>& nodes, const int* slots, const int (&node)[D]) {
+  int neighbour = 0;
+#pragma unroll
+  for (int axis = D - 1; axis >= 0; axis--) neighbour |= (node[axis] >= kBlockWidth) << (D - 1 - axis);
+  T value[K] = {};
+  if (slots[neighbour] >= 0)
+    load_node<Quads>(nodes, slots[neighbour] * kBlockNodes<D> + node_in_block<D>(node), 0, value);
+  NodeValue<T, K> v{};
+#pragma unroll
+  for (int c = 0; c < K; c++) v.e[c] = value[c];
+  return v;
+}
+
 template <bool Quads, int Order, class T, int K, int D, int Threads = kGatherThreads<D>>
 __device__ void load_tile(const NodeField<const T>& nodes, const int* slots, NodeValue<T, K>* tile) {
   constexpr int width = kBlockWidth + Order, size = D == 2 ? width * width : width * width * width;
   for (int i = threadIdx.x; i < size; i += Threads) {
-    int node[D], neighbour = 0;
+    int node[D];
 #pragma unroll
-    for (int axis = D - 1, rest = i; axis >= 0; axis--) {
-      node[axis] = rest % width;
-      neighbour |= (node[axis] >= kBlockWidth) << (D - 1 - axis);
-      rest /= width;
-    }
-    T value[K] = {};
-    if (slots[neighbour] >= 0)
-      load_node<Quads>(nodes, slots[neighbour] * kBlockNodes<D> + node_in_block<D>(node), 0, value);
-    NodeValue<T, K> v{};
-#pragma unroll
-    for (int c = 0; c < K; c++) v.e[c] = value[c];
-    tile[i] = v;
+    for (int axis = D - 1, rest = i; axis >= 0; axis--, rest /= width) node[axis] = rest % width;
+    tile[i] = load_near<Quads, K>(nodes, slots, node);
   }
 }
 
