@@ -13,15 +13,15 @@
 // kernels, and a graph with a loop needs no host between its turns.
 namespace mpm {
 
-// Captures the graphs of a thread, and stores the latest one. The next graph mostly differs in its pointers only, and
-// an update of these takes a third of the time of a new graph. It has a separate stream, since torch's default stream
-// cannot be captured.
+// Captures the graphs of a thread, and stores the latest one of each of two numbers. The next graph mostly differs in
+// its pointers only, and an update of these takes a third of the time of a new graph. It has a separate stream, since
+// torch's default stream cannot be captured.
 class CapturedGraph {
  public:
-  static CapturedGraph& of_this_thread() {
+  static CapturedGraph& of_this_thread(int number = 0) {
     static thread_local CapturedGraph* const latest =
-        new CapturedGraph;  // never destroyed: CUDA may be unloaded before
-    return *latest;
+        new CapturedGraph[2];  // never destroyed: CUDA may be unloaded before
+    return latest[number];
   }
 
   template <class Work>
@@ -150,17 +150,30 @@ inline bool is_captured(cudaStream_t stream) {
 }
 
 // Number of replays of `work(stream)`: `times`, or zero if a capture would not pay or the stream itself is captured.
-// The work must consist of kernels, copies and memsets only. `launched()` is called after each replay.
+// The work must consist of kernels, copies and memsets only. `launched(count)` is called after each launch of a graph,
+// with its number of replays. A device waits 5 µs between two graphs, so of many replays several are one graph, which
+// is captured while the first ones run.
 template <class Work, class Launched>
 int64_t replay(int64_t times, cudaStream_t stream, const Work& work, const Launched& launched) {
+  constexpr int64_t many = 32, first = 8, together = 4;
   if (times < kLeastReplays || is_captured(stream)) return 0;
-  CapturedGraph& graph = CapturedGraph::of_this_thread();
-  graph.capture(work);
-  for (int64_t k = 0; k < times; k++) {
-    graph.launch(stream);
-    launched();
-  }
-  return times;
+  const auto launch = [&](const CapturedGraph& graph, int64_t graphs, int64_t replays) {
+    for (int64_t k = 0; k < graphs; k++) {
+      graph.launch(stream);
+      launched(replays);
+    }
+    return graphs * replays;
+  };
+  CapturedGraph& one = CapturedGraph::of_this_thread();
+  one.capture(work);
+  if (times < many) return launch(one, times, 1);
+  int64_t done = launch(one, first, 1);
+  CapturedGraph& several = CapturedGraph::of_this_thread(1);
+  several.capture([&](cudaStream_t on) {
+    for (int64_t k = 0; k < together; k++) work(on);
+  });
+  done += launch(several, (times - done) / together, together);
+  return done + launch(one, times - done, 1);
 }
 
 #if CUDART_VERSION >= 13000

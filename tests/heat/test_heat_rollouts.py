@@ -123,10 +123,10 @@ def test_particles_leave_their_blocks(dim, scenes, stiff, device):
 PLACES = {("dim", "scenes", "with_boundaries"): [(2, 1, True), (3, 1, False), (2, 3, False), (3, 1, True)]}
 
 
-@pytest.mark.parametrize(*in_pairs(PLACES, law=LAWS, n=[2, 3, 4, 17, 40], cells=[0.01, 0.1]))
+@pytest.mark.parametrize(*in_pairs(PLACES, law=LAWS, n=[2, 3, 4, 17, 40, 75], cells=[0.01, 0.1]))
 def test_steps_that_begin_during_the_solve(law, scenes, with_boundaries, cells, dim, n, device):
     """On CUDA, P2G of the next substep runs beside the solve unless particles have moved too far, and updates F: for
-    calls just long enough, with graphs and without, and with activations in between."""
+    calls just long enough, with graphs of two substeps and of more, and without, and with activations in between."""
     step, state = scene(dim, torch.float32, scenes, law, max_blocks=scenes * 3**dim, device=device)
     if with_boundaries:
         step = held(step, (heat_boundaries.FixedSurface, bodies(dim)["sphere"], 40.0))

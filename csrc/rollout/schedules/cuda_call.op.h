@@ -176,9 +176,9 @@ class CudaCall {
     s_.p2g_is_ahead = goes_ahead_ && step_ > 0 && step_ + 2 < in_.n;
     if (s_.p2g_is_ahead) {
       const SideStream::Fork side(on);
-      conduct(to, side.stream());
+      conduct(to, on);
       from_ = constant(to);
-      begin_next(1 - into, on);
+      begin_next(1 - into, side.stream());
     } else if (heat_) {
       conduct(to, on);
     }
@@ -225,7 +225,7 @@ class CudaCall {
     return false;
   }
 
-  // Computes the substeps from `step_` on. A CUDA graph repeats pairs of them.
+  // Computes the substeps from `step_` on. CUDA graphs repeat pairs of them.
   void run_per_step() {
     // Laws of temperature read the result of the solve.
     goes_ahead_ = heat_ && s_.fused && !thermal_ && s_.displacements.defined() && s_.next.emptied &&
@@ -237,7 +237,8 @@ class CudaCall {
       after_substeps(P(), 1, stream_);
       if (++step_ == 2) {
         const auto two = [&](backend::Stream on) { substep(0, false, on), substep(1, false, on); };
-        step_ += 2 * replay((in_.n - step_ - after) / 2, stream_, two, [&] { after_substeps(P(), 2, stream_); });
+        step_ += 2 * replay((in_.n - step_ - after) / 2, stream_, two,
+                            [&](int64_t count) { after_substeps(P(), 2 * count, stream_); });
       }
     }
   }
