@@ -149,13 +149,16 @@ inline bool is_captured(cudaStream_t stream) {
   return cudaStreamIsCapturing(stream, &status) != cudaSuccess || status != cudaStreamCaptureStatusNone;
 }
 
+// Replays of substeps in a graph of many. A device waits 5 µs between two graphs, which matters for few particles only,
+// and launched work cannot be interrupted.
+inline int64_t replays_of_graph(int64_t particles) { return particles <= int64_t(1) << 20 ? 4 : 1; }
+
 // Number of replays of `work(stream)`: `times`, or zero if a capture would not pay or the stream itself is captured.
 // The work must consist of kernels, copies and memsets only. `launched(count)` is called after each launch of a graph,
-// with its number of replays. A device waits 5 µs between two graphs, so of many replays several are one graph, which
-// is captured while the first ones run.
+// with its number of replays. Of many replays, `together` are one graph, which is captured while the first ones run.
 template <class Work, class Launched>
-int64_t replay(int64_t times, cudaStream_t stream, const Work& work, const Launched& launched) {
-  constexpr int64_t many = 32, first = 8, together = 4;
+int64_t replay(int64_t times, int64_t together, cudaStream_t stream, const Work& work, const Launched& launched) {
+  constexpr int64_t many = 32, first = 8;
   if (times < kLeastReplays || is_captured(stream)) return 0;
   const auto launch = [&](const CapturedGraph& graph, int64_t graphs, int64_t replays) {
     for (int64_t k = 0; k < graphs; k++) {
@@ -166,7 +169,7 @@ int64_t replay(int64_t times, cudaStream_t stream, const Work& work, const Launc
   };
   CapturedGraph& one = CapturedGraph::of_this_thread();
   one.capture(work);
-  if (times < many) return launch(one, times, 1);
+  if (times < many || together == 1) return launch(one, times, 1);
   int64_t done = launch(one, first, 1);
   CapturedGraph& several = CapturedGraph::of_this_thread(1);
   several.capture([&](cudaStream_t on) {

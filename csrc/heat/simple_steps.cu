@@ -7,7 +7,7 @@
 // The simple steps of heat (csrc/heat/solve.h): a thread block packs the particles of an item, unless G2P has done
 // that, and then a warp sums the products H u of an item, or of few items a thread block. Unlike csrc/heat/heat.cu this
 // needs no barriers of the whole grid, and particles may have left their base block since the activation. Those are at
-// the end of the packed particles of their item.
+// the end of the packed particles of their item; of few items, further thread blocks add the first of these.
 //
 // Where sums have an order, a warp packs the particles of an item in that of the index, and stores the sums of a base
 // block in a tile (transfer/tiles.h). All particles are in their base blocks there. The order does not depend on the

@@ -237,7 +237,7 @@ class CudaCall {
       after_substeps(P(), 1, stream_);
       if (++step_ == 2) {
         const auto two = [&](backend::Stream on) { substep(0, false, on), substep(1, false, on); };
-        step_ += 2 * replay((in_.n - step_ - after) / 2, stream_, two,
+        step_ += 2 * replay((in_.n - step_ - after) / 2, replays_of_graph(P()), stream_, two,
                             [&](int64_t count) { after_substeps(P(), 2 * count, stream_); });
       }
     }

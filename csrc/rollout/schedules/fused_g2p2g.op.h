@@ -77,8 +77,8 @@ void FusedG2P2G<T, D>::run(const Particles<const T>& given, const int* before) {
   int64_t step = 1;
   run_substep(step++, false, stream_);
   const auto two = [&](backend::Stream on) { run_substep(step, false, on), run_substep(step + 1, false, on); };
-  step +=
-      2 * replay((last - step) / 2, stream_, two, [&](int64_t count) { after_substeps(rows_, 2 * count, stream_); });
+  step += 2 * replay((last - step) / 2, replays_of_graph(rows_), stream_, two,
+                     [&](int64_t count) { after_substeps(rows_, 2 * count, stream_); });
   for (; step <= last; step++) {
     run_substep(step, step == last, stream_);
     after_substeps(rows_, 1, stream_);
