@@ -107,7 +107,12 @@ def _is_differentiated(contents: Sequence[Any]) -> bool:
 def _kept(cache: DeviceConstantCache, contents: Sequence[Any], make: Callable[[], Any], x: Tensor) -> Any:
     """What is made of tensors and numbers for particles at x [P, D], without gradients; from the cache while these have
     not changed."""
-    return cache.get((x.dtype, x.device, x.shape[1], *contents), torch.no_grad()(make), x)
+
+    def made() -> Any:
+        with torch.no_grad():
+            return make()
+
+    return cache.get((x.dtype, x.device, x.shape[1], *contents), made, x)
 
 
 def tables_of_parameters(law: CompiledLaw, x: Tensor) -> Tables | None:
