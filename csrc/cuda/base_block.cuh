@@ -40,6 +40,22 @@ __device__ int locate_slot(const Topology<T, D>& t, int scene, const Vector<T, D
   return t.table[block_index(t.geometry, scene, block)];
 }
 
+// Coordinates of number i in a cube of a width.
+template <int Width, int D>
+__device__ void split(int i, int (&at)[D]) {
+#pragma unroll
+  for (int axis = D - 1; axis >= 0; axis--, i /= Width) at[axis] = i % Width;
+}
+
+// The neighbour, in the schedule, with a node that is counted from the first one of a base block.
+template <int D>
+__device__ int neighbour_with(const int (&node)[D]) {
+  int neighbour = 0;
+#pragma unroll
+  for (int i = D - 1; i >= 0; i--) neighbour |= int(node[i] >= kBlockWidth) << (D - 1 - i);
+  return neighbour;
+}
+
 // Blocks in the support of a base node, given relative to its own block: a bit for each of the neighbours in the
 // schedule.
 template <int Order, int D>

@@ -168,8 +168,9 @@ struct AdvanceItem {
     if (slot < 0) return;
     for (int n = lane_index(); n < kSupportNodes<Order, D>; n += 32) {
       int node[D];
+      split<Order + 1>(n, node);
 #pragma unroll
-      for (int i = D - 1, rest = n; i >= 0; i--, rest /= Order + 1) node[i] = base[i] + rest % (Order + 1);
+      for (int i = D - 1; i >= 0; i--) node[i] += base[i];
       to[n] = load_near<K::quads, D>(k.motion.nodes, schedule_of(topology()).neighbours + (int64_t(slot) << D), node);
     }
   }

@@ -108,14 +108,14 @@ struct Directions {
   __device__ T of(int64_t node) const { return simple_direction(a, node, steps, c, dt); }
   // Those of four nodes of a row, whose inputs are loaded together.
   __device__ Vec4<T> at(int node) const {
-    const HeatArguments<T, D>& s = a.solve;
+    static_assert(kMostSimpleSteps == 3);  // the last product is not read
     Vec4<T> product[kMostSimpleSteps - 1]{}, u;
     NodeInputs<T> in[kBlockWidth];
 #pragma unroll
     for (int j = 0; j < kMostSimpleSteps - 1; j++)
       if (j < a.step) product[j] = load_vec4(a.product[j] + node);
 #pragma unroll
-    for (int k = 0; k < kBlockWidth; k++) in[k] = node_inputs(s, node + k);
+    for (int k = 0; k < kBlockWidth; k++) in[k] = node_inputs(a.solve, node + k);
 #pragma unroll
     for (int k = 0; k < kBlockWidth; k++) {
       const T at_start = product[0].e[k], after_first = product[1].e[k];
@@ -283,8 +283,8 @@ __device__ Vec4<T> sum_of_warps(const T (*sums)[N], int at) {
 
 // Number of particles out of the base block of an item that another thread block adds, where several warps share an
 // item: a chain of loads leads to the nodes of each, which takes as long as the product of the others.
-template <bool InOrder, int Warps>
-constexpr int kApart = !InOrder && Warps > 1 ? 8 : 0;
+template <int Warps>
+constexpr int kApart = Warps > 1 ? 8 : 0;
 
 // Least number of thread blocks of a multiprocessor; of many items as many threads as in csrc/heat/heat.cu.
 template <int Warps, int Order, class T>
@@ -359,8 +359,9 @@ template <bool InOrder, int Warps, int Order, class T, int D>
 __global__ void __launch_bounds__(kProductThreads, kProductBlocks<Warps, Order, T>)
     product_kernel(const __grid_constant__ SimpleKernel<Order, T, D> k, int blocks) {
   using S = typename SimpleKernel<Order, T, D>::S;
-  constexpr int together = kProductWarps / Warps,
-                apart = kApart<InOrder, Warps>;  // `together`: items of a thread block
+  static_assert(!InOrder || Warps == 1);
+  constexpr int together = kProductWarps / Warps;  // items of a thread block
+  constexpr int apart = kApart<Warps>;
   grid_dependency_sync();
   __shared__ alignas(16) T values_of_items[together][S::tile];
   __shared__ alignas(16) T sums_of_warps[kProductWarps][S::tile];
@@ -414,7 +415,7 @@ void multiply(const SimpleKernel<Order, T, D>& kernel, int64_t items, Stream str
   const int64_t few = int64_t(device_attribute(cudaDevAttrMultiProcessorCount)) * 8,
                 all = (items + together - 1) / together;
   const unsigned blocks = grid_size(kernel.a.step < 2 ? all : std::min(all, few)),
-                 apart = kApart<InOrder, Warps> > 0 ? (blocks + kProductWarps - 1) / kProductWarps : 0;
+                 apart = kApart<Warps> > 0 ? (blocks + kProductWarps - 1) / kProductWarps : 0;
   launch_in_chain(product_kernel<InOrder, Warps, Order, T, D>, blocks + apart, kProductThreads, 0, stream, kernel,
                   int(blocks));
 }

@@ -303,6 +303,11 @@ MPM_HD SimpleNode<T> simple_node(const NodeInputs<T>& in, int steps, int k, doub
   if (e.free) take_simple_steps<T>(n, steps, k, c, product);
   return n;
 }
+template <class T, int D>
+MPM_HD SimpleNode<T> simple_node(const HeatSimpleArguments<T, D>& a, int64_t row, int steps, int k, double c,
+                                 double dt) {
+  return simple_node(node_inputs(a.solve, row), steps, k, c, dt, [&](int j) { return a.product[j][row]; });
+}
 
 // The values u of a product H u of the simple steps, after the first one.
 template <class T>
@@ -312,15 +317,13 @@ MPM_HD T simple_direction(const SimpleNode<T>& n) {
 template <class T, int D>
 MPM_HD T simple_direction(const HeatSimpleArguments<T, D>& a, int64_t row, int steps, double c, double dt) {
   if (a.step == 0) return theta_at(a.solve, row);
-  return simple_direction(
-      simple_node(node_inputs(a.solve, row), steps, a.step - 1, c, dt, [&](int j) { return a.product[j][row]; }));
+  return simple_direction(simple_node(a, row, steps, a.step - 1, c, dt));
 }
 
 // The increment of a node after these steps.
 template <class T, int D>
 MPM_HD T simple_increment(const HeatSimpleArguments<T, D>& a, int64_t row, int steps, double c, double dt) {
-  return simple_node(node_inputs(a.solve, row), steps, steps, c, dt, [&](int j) { return a.product[j][row]; })
-      .increment;
+  return simple_node(a, row, steps, steps, c, dt).increment;
 }
 
 // Next direction; returns the part of p · A p without H.

@@ -406,12 +406,9 @@ __device__ void gather_in_memory_order(const Task& task, const Schedule<const in
 // Zero where a block is not active.
 template <bool Quads, int K, class T, int D>
 __device__ NodeValue<T, K> load_near(const NodeField<const T>& nodes, const int* slots, const int (&node)[D]) {
-  int neighbour = 0;
-#pragma unroll
-  for (int axis = D - 1; axis >= 0; axis--) neighbour |= (node[axis] >= kBlockWidth) << (D - 1 - axis);
+  const int slot = slots[neighbour_with(node)];
   T value[K] = {};
-  if (slots[neighbour] >= 0)
-    load_node<Quads>(nodes, slots[neighbour] * kBlockNodes<D> + node_in_block<D>(node), 0, value);
+  if (slot >= 0) load_node<Quads>(nodes, slot * kBlockNodes<D> + node_in_block<D>(node), 0, value);
   NodeValue<T, K> v{};
 #pragma unroll
   for (int c = 0; c < K; c++) v.e[c] = value[c];
@@ -423,8 +420,7 @@ __device__ void load_tile(const NodeField<const T>& nodes, const int* slots, Nod
   constexpr int width = kBlockWidth + Order, size = D == 2 ? width * width : width * width * width;
   for (int i = threadIdx.x; i < size; i += Threads) {
     int node[D];
-#pragma unroll
-    for (int axis = D - 1, rest = i; axis >= 0; axis--, rest /= width) node[axis] = rest % width;
+    split<width>(i, node);
     tile[i] = load_near<Quads, K>(nodes, slots, node);
   }
 }

@@ -507,8 +507,7 @@ __device__ void add_one_out_of_block(const Nodes& nodes, const SharedParticles<S
   constexpr int D = S::D, count = D == 2 ? S::support * S::support : S::support * S::slab;
   for (int n = threadIdx.x % 32; n < count; n += 32) {
     int offset[D];
-#pragma unroll
-    for (int i = D - 1, rest = n; i >= 0; i--, rest /= S::support) offset[i] = rest % S::support;
+    split<S::support>(n, offset);
     const int64_t at = node_row(offset);
     if (at < 0) continue;
     T value[S::channels];

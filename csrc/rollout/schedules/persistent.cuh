@@ -106,11 +106,6 @@ struct TileNodes {
     return node.neighbour < 0 ? slot_update(update, node.slot) : m.there[node.neighbour];
   }
 
-  template <int Width>
-  __device__ static void split(int i, int (&offset)[D]) {
-#pragma unroll
-    for (int axis = D - 1; axis >= 0; axis--, i /= Width) offset[axis] = i % Width;
-  }
   __device__ static int in_tile(const int (&offset)[D]) {
     int place = 0;
 #pragma unroll
@@ -346,7 +341,7 @@ class ItemStep {
 
   __device__ int corner() const {
     int offset[D];
-    TileNodes<S>::template split<kBlockWidth>(cell_, offset);
+    split<kBlockWidth>(cell_, offset);
     return TileNodes<S>::in_tile(offset);
   }
 
