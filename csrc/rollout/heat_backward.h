@@ -63,7 +63,7 @@ class HeatBackward {
   HeatToParticlesBackwardArguments<T, D> to_particles(const HeatSolution<T, D>& solution, const HeatAdjoints& adjoints);
   void scatter(const HeatToParticlesBackwardArguments<T, D>& up);
   void solve(HeatArguments<T, D> system, const Tensor& status);
-  void multiply(const HeatArguments<T, D>& system);
+  void multiply(HeatArguments<T, D> system);
   HeatTermBackwardArguments<T, D> term_backward(const HeatSolution<T, D>& solution,
                                                 const HeatTermArguments<T, D>& term) const;
   void adjoint_of_terms(const HeatSolution<T, D>& solution);
@@ -92,7 +92,8 @@ class HeatBackward {
   // Of a held surface: adjoint of the exchange of the nodes, and gathered [P, 1]; of κ V [P], of x [P, D], and of the
   // distance [P]; of the row of its obstacle, by slots.
   Tensor layer_, layer_exchange_, layer_of_particles_, by_conductance_, x_layer_, by_distance_, row_sums_;
-  Tensor iterations_, residual_, converged_, workspace_, operator_workspace_;
+  Tensor no_bound_;  // [B], of the spectrum
+  Tensor iterations_, residual_, converged_, workspace_;
 };
 
 template <class T, int D>
@@ -114,6 +115,8 @@ HeatBackward<T, D>::HeatBackward(Recorded<T, D>& record, const SubstepsInputs& i
   x_layer_ = result(x, heat().holds_surface(), {P, D});
   surface_value_ = result(x, heat().has_terms(), {P, 1 + D});
   surface_gradient_ = result(x, heat().has_terms(), {P, 1 + D, D});
+  no_bound_ = empty(x, {in.scenes}, ScalarType::Double);
+  torch::stable::zero_(no_bound_);
   iterations_ = empty_int(x, {in.scenes});
   residual_ = empty(x, {in.scenes});
   converged_ = empty(x, {in.scenes}, ScalarType::Bool);
@@ -134,7 +137,7 @@ void HeatBackward<T, D>::make_nodes(const HeatSolution<T, D>& solution) {
   solved_ = empty(in_.x, {nodes, kHeatSolved});
   if (heat().holds_surface()) layer_ = empty(in_.x, {nodes});
   if (heat().has_terms()) surface_ = empty(in_.x, {nodes, kHeatChannels}), by_terms_ = empty(in_.x, {nodes});
-  workspace_ = operator_workspace_ = Tensor();
+  workspace_ = Tensor();
 }
 
 template <class T, int D>
@@ -191,20 +194,17 @@ void HeatBackward<T, D>::solve(HeatArguments<T, D> system, const Tensor& status)
   solve_simply(order(), finish, stream_);
 }
 
-// H λ.
+// H λ: the first product of the simple steps, with λ in place of θ; with a bound of zero every scene takes that step.
 template <class T, int D>
-void HeatBackward<T, D>::multiply(const HeatArguments<T, D>& system) {
-  HeatOperatorArguments<T, D> a;
-  a.topology = system.topology;
-  a.x = system.x;
-  a.conductance = system.conductance;
-  a.nodes = rows(multiplier_);
-  a.deterministic = system.deterministic;
-  a.sum = rows(product_);
-  if (!operator_workspace_.defined())
-    operator_workspace_ = empty(in_.x, {backend::heat_operator_workspace(a, stream_)}, ScalarType::Byte);
-  a.workspace = operator_workspace_.data_ptr();
-  backend::heat_operator(order(), a, stream_);
+void HeatBackward<T, D>::multiply(HeatArguments<T, D> system) {
+  system.theta = rows(multiplier_);
+  system.sums = nullptr;
+  system.scene_bound = static_cast<const double*>(no_bound_.data_ptr());
+  system.workspace = workspace_.data_ptr();
+  HeatSimpleArguments<T, D> a;
+  a.solve = system;
+  a.product[0] = rows(product_);
+  backend::heat_simple_step(order(), a, stream_);
 }
 
 template <class T, int D>
