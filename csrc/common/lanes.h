@@ -69,6 +69,14 @@ MPM_HD void store_vector(const At& at, const Field<T>& f, const Vector<typename 
     at.store(f.pointer + i * f.stride[1], f.stride[0], a[i]);
 }
 
+// All entries are loaded before any is stored. A compiler keeps the order of a store and a load that may be of the same
+// memory, so that otherwise each entry takes the time of an access.
+template <int D, class At, class T>
+MPM_HD void store_vector(const Adding<At>& at, const Field<T>& f, const Vector<typename At::Value, D>& a) {
+  const At& plain = at;
+  store_vector<D>(plain, f, load_vector<D>(plain, constant(f)) + a);
+}
+
 template <int D, class At, class T>
 MPM_HD Matrix<typename At::Value, D> load_matrix(const At& at, const Field<const T>& f) {
   Matrix<typename At::Value, D> r;
@@ -81,6 +89,12 @@ template <int D, class At, class T>
 MPM_HD void store_matrix(const At& at, const Field<T>& f, const Matrix<typename At::Value, D>& a) {
   MPM_UNROLL for (int i = 0; i < D; i++) MPM_UNROLL
     for (int j = 0; j < D; j++) at.store(f.pointer + i * f.stride[1] + j * f.stride[2], f.stride[0], a[i][j]);
+}
+
+template <int D, class At, class T>
+MPM_HD void store_matrix(const Adding<At>& at, const Field<T>& f, const Matrix<typename At::Value, D>& a) {
+  const At& plain = at;
+  store_matrix<D>(plain, f, load_matrix<D>(plain, constant(f)) + a);
 }
 
 }  // namespace TORCH_MPM_ISA

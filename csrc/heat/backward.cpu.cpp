@@ -38,8 +38,9 @@ template <class T, int D>
   const AtGroup<T> at{g};
   const Field<T> after = entry(a.moment, kHeatAfter), multiplier = entry(a.moment, kHeatMultiplier);
   const HeatGradients<P, D> gradients{load_vector<D>(at, constant(after)), load_vector<D>(at, constant(multiplier))};
-  const P dt(step_of_scene(a.forward.scene_dt, a.forward.dt, scene));
-  const HeatForms<P, D> forms = heat_of_nodes_backward(a, at, scene, dt, gathered, gradients);
+  const HeatOfParticle<P, D> heat = load_heat(a.forward, at, scene);
+  HeatForms<P, D> forms = heat.forms();
+  heat_of_nodes_backward(a, at, scene, heat, gathered, gradients, forms);
   for (int k = 0; k < kHeatChannels; k++) store_scalar(at, entry(a.value, k), forms.value[k]);
   store_vector<D>(at, entry(a.moment, kHeatTheta), forms.theta);
   store_vector<D>(at, entry(a.moment, kHeatMean), forms.mean);

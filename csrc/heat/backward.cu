@@ -71,7 +71,7 @@ struct HeatToNodesPullBack {
   static constexpr int resident = 3;
   static constexpr int first_gradient = kHeatAfter - K;
   static_assert(kHeatTheta == 2 && kHeatMean == 3 && first_gradient == 2 && Others == K);  // channels with moments
-  using OfSums = SumShape<Order, T, D, K, kHeatTheta, true, false, SlopeForm::none>;
+  using OfSums = SumShape<Order, T, D, K, kHeatTheta, true, false, SlopeForm::affine>;
   using OfSolved = SumShape<Order, T, D, K, first_gradient, true, false, SlopeForm::none>;
   using Slope = SumShape<Order, T, D, K, K, false, false, SlopeForm::affine>;
   struct Loaded {
@@ -102,29 +102,22 @@ struct HeatToNodesPullBack {
   template <class Support, class OtherSupport>
   __device__ Result compute(const Loaded& l, const Weights<Order, T, D>& w, const Support& support,
                             const OtherSupport& solved) const {
-    const HeatForms<T, D> forms = pull_back(l, w, support, solved);
-    Factors of_sums, of_solved;
-#pragma unroll
-    for (int k = 0; k < K; k++) of_sums.value[k] = forms.value[k];
     const One<T> at{l.p};
-#pragma unroll
-    for (int k = 0; k < first_gradient; k++) of_solved.value[k] = load_scalar(at, constant(entry(a.value, K + k)));
+    const HeatOfParticle<T, D> heat = load_heat(a.forward, at, l.scene);
+    HeatForms<T, D> forms = heat.forms();
+    HeatGathered<T, D, K> gathered;
+    const Vector<T, D> slope_of_sums = sum(w, support, forms, gathered);
+    const HeatGradients<T, D> gradients = gradients_of(w, solved);
+    Factors of_solved = load_factors(at);  // before results are stored, as in common/lanes.h
+    heat_of_nodes_backward(a, at, l.scene, heat, gathered, gradients, forms);
 #pragma unroll
     for (int d = 0; d < D; d++) {
-      of_sums.moment[kHeatTheta][d] = dx * forms.theta[d];
-      of_sums.moment[kHeatMean][d] = dx * forms.mean[d];
       of_solved.moment[first_gradient][d] = dx * forms.after[d];
       of_solved.moment[first_gradient + 1][d] = dx * forms.multiplier[d];
     }
-    if (a.gradient.pointer) {
-#pragma unroll
-      for (int k = 0; k < first_gradient; k++) {
-        const Vector<T, D> moment = load_vector<D>(at, constant(entry(a.moment, K + k)));
-#pragma unroll
-        for (int d = 0; d < D; d++) of_solved.moment[k][d] = dx * moment[d];
-      }
-    }
-    return slope(w, support, of_sums) + slope(w, solved, of_solved);
+    forget_nodes();
+    Sums<Slope> sums;
+    return inverse_dx * (slope_of_sums + slope(w, solved, of_solved, sums));
   }
   __device__ void write(int p, const Loaded&, const Result& x) const {
 #pragma unroll
@@ -136,38 +129,62 @@ struct HeatToNodesPullBack {
   }
 
  private:
-  template <class Support, class OtherSupport>
-  __device__ HeatForms<T, D> pull_back(const Loaded& l, const Weights<Order, T, D>& w, const Support& support,
-                                       const OtherSupport& solved) const {
-    const Sums<OfSums> sums = sum_support<OfSums>(support, w);
-    forget_nodes();
-    const Sums<OfSolved> of_solved = sum_support<OfSolved>(solved, w);
-    const T scale = T(a.inverse_inertia) * dx;
-    HeatGathered<T, D, K> gathered;
-    HeatGradients<T, D> gradients;
+  // Of the forms of G2P.
+  __device__ Factors load_factors(const One<T>& at) const {
+    Factors f;
+#pragma unroll
+    for (int k = 0; k < first_gradient; k++) {
+      f.value[k] = load_scalar(at, constant(entry(a.value, K + k)));
+      const Vector<T, D> moment =
+          a.gradient.pointer ? load_vector<D>(at, constant(entry(a.moment, K + k))) : zero_vector<T, D>();
+#pragma unroll
+      for (int d = 0; d < D; d++) f.moment[k][d] = dx * moment[d];
+    }
+    return f;
+  }
+  // The adjoints of the sums; returns the slope of the forms of P2G, per cell.
+  template <class Support>
+  __device__ Vector<T, D> sum(const Weights<Order, T, D>& w, const Support& support, const HeatForms<T, D>& forms,
+                              HeatGathered<T, D, K>& gathered) const {
+    Factors f;
+#pragma unroll
+    for (int k = 0; k < K; k++) f.value[k] = forms.value[k];
+#pragma unroll
+    for (int d = 0; d < D; d++) {
+      f.moment[kHeatTheta][d] = dx * forms.theta[d];
+      f.moment[kHeatMean][d] = dx * forms.mean[d];
+    }
+    Sums<OfSums> sums;
+    const Vector<T, D> r = slope(w, support, f, sums);
 #pragma unroll
     for (int k = 0; k < K; k++) {
       gathered.value[k] = sums.value[k];
 #pragma unroll
       for (int d = 0; d < D; d++) gathered.moment[k][d] = k >= kHeatTheta ? dx * sums.moment[k][d] : T(0);
     }
-#pragma unroll
-    for (int d = 0; d < D; d++) {
-      gradients.after[d] = scale * of_solved.moment[first_gradient][d];
-      gradients.multiplier[d] = scale * of_solved.moment[first_gradient + 1][d];
-    }
-    const T dt = step_of_scene(a.forward.scene_dt, a.forward.dt, l.scene);
-    return heat_of_nodes_backward(a, One<T>{l.p}, l.scene, dt, gathered, gradients);
+    return r;
   }
   template <class Support>
-  __device__ Vector<T, D> slope(const Weights<Order, T, D>& w, const Support& support, const Factors& f) const {
-    forget_nodes();
+  __device__ HeatGradients<T, D> gradients_of(const Weights<Order, T, D>& w, const Support& solved) const {
+    const Sums<OfSolved> sums = sum_support<OfSolved>(solved, w);
+    const T scale = T(a.inverse_inertia) * dx;
+    HeatGradients<T, D> g;
+#pragma unroll
+    for (int d = 0; d < D; d++) {
+      g.after[d] = scale * sums.moment[first_gradient][d];
+      g.multiplier[d] = scale * sums.moment[first_gradient + 1][d];
+    }
+    return g;
+  }
+  // Per cell, with the sums of its shape.
+  template <class Support, class S>
+  __device__ Vector<T, D> slope(const Weights<Order, T, D>& w, const Support& support, const Factors& f,
+                                Sums<S>& sums) const {
     const T none[K][D] = {};
-    Sums<Slope> sums;
-    position_slope<Slope, false>(support, w, f.value, f.moment, none, sums);
+    position_slope<S, false>(support, w, f.value, f.moment, none, sums);
     Vector<T, D> x;
 #pragma unroll
-    for (int d = 0; d < D; d++) x[d] = inverse_dx * sums.slope[d];
+    for (int d = 0; d < D; d++) x[d] = sums.slope[d];
     return x;
   }
 };

@@ -130,9 +130,6 @@ MPM_HD void heat_of_particles_backward(const HeatToParticlesBackwardArguments<T,
     pull_back_melting(a, at, scene, blended(gathered.value[0], gathered.value[1], theta, blend), by_theta);
   const BlendedAdjoint<V> by =
       pull_back_blended(gathered.value[0], gathered.value[1], theta, blend, by_theta, by_blend);
-  store_scalar(at, entry(a.value, kHeatIncrement), by.increment);
-  store_scalar(at, entry(a.value, kHeatAverage), by.average);
-  store_scalar(at, a.theta, by.before);
   if constexpr (Affine) {
     const Vector<V, D> before = load_vector<D>(at, f.particles.gradient);
     const auto &increment = gathered.moment[0], &average = gathered.moment[1];
@@ -148,6 +145,9 @@ MPM_HD void heat_of_particles_backward(const HeatToParticlesBackwardArguments<T,
     store_vector<D>(at, entry(a.moment, kHeatAverage), V(T(f.moment_scale)) * by_average);
     store_vector<D>(at, a.gradient, adjoint);
   }
+  store_scalar(at, entry(a.value, kHeatIncrement), by.increment);
+  store_scalar(at, entry(a.value, kHeatAverage), by.average);
+  store_scalar(at, a.theta, by.before);
   store_scalar(at, a.blend, by_blend);
 }
 
@@ -272,11 +272,90 @@ struct HeatForms {
   Vector<V, D> theta, mean, after, multiplier;
 };
 
+// Heat of a particle as P2G transfers it, and the arguments of the weights: volume, specific heat, conductivity, mass,
+// dt and |sym ∇v|.
+template <class V, int D>
+struct HeatOfParticle {
+  V in[6];
+  HeatWeights<V> weights;
+  V theta;
+  Vector<V, D> gradient;  // zero where particles have none
+
+  // The forms of P2G.
+  MPM_HD HeatForms<V, D> forms() const {
+    HeatForms<V, D> f{};
+    const HeatSums<V> sums = heat_sums(weights, theta);
+    f.value[kHeatCapacity] = sums.capacity;
+    f.value[kHeatVarying] = sums.varying;
+    f.value[kHeatTheta] = sums.theta;
+    f.value[kHeatMean] = sums.mean;
+    MPM_UNROLL for (int d = 0; d < D; d++) {
+      const HeatSums<V> moment = heat_sums(weights, gradient[d]);
+      f.theta[d] = moment.theta, f.mean[d] = moment.mean;
+    }
+    return f;
+  }
+};
+
+template <class At, class T, int D>
+MPM_HD HeatOfParticle<typename At::Value, D> load_heat(const HeatToNodesArguments<T, D>& f, const At& at, int scene) {
+  using V = typename At::Value;
+  const HeatParticles<T>& particles = f.particles;
+  HeatOfParticle<V, D> h{
+      {load_scalar(at, particles.volume), load_value(at, f.specific_heat, scene), load_value(at, f.conductivity, scene),
+       load_scalar(at, f.mass), V(step_of_scene(f.scene_dt, f.dt, scene)),
+       strain_rate_of(load_matrix<D>(at, f.velocity_gradient))},
+      {},
+      load_scalar(at, particles.theta),
+      particles.gradient.pointer ? load_vector<D>(at, particles.gradient) : zero_vector<V, D>()};
+  h.weights = heat_weights(h.in[0], h.in[1], h.in[2], h.in[3], h.in[4], h.in[5], V(f.topology.geometry.dx));
+  h.weights.blend = blend_of(f.transfer, h.weights.blend);
+  return h;
+}
+
 // ∇(θ + d) and ∇λ at a particle.
 template <class V, int D>
 struct HeatGradients {
   Vector<V, D> after, multiplier;
 };
+
+// Adjoints to which the adjoint of P2G adds, zero where they are absent. They are loaded with the inputs of a particle,
+// before any of them is stored, as in lanes.h.
+template <class V, int D>
+struct HeatNodesSums {
+  V theta, mass, volume;
+  Vector<V, D> gradient;
+  Matrix<V, D> velocity_gradient;
+};
+
+// Whether β depends on the step and on ∇v.
+template <class T, int D>
+MPM_HD bool blend_varies(const HeatToNodesBackwardArguments<T, D>& a) {
+  return a.forward.transfer == HeatTransfer::hybrid;
+}
+
+template <class At, class T>
+MPM_HD typename At::Value load_if_present(const At& at, const Field<T>& f) {
+  return f.pointer ? load_scalar(at, constant(f)) : typename At::Value(0);
+}
+
+template <class At, class T, int D>
+MPM_HD HeatNodesSums<typename At::Value, D> load_sums(const HeatToNodesBackwardArguments<T, D>& a, const At& at) {
+  using V = typename At::Value;
+  return {load_if_present(at, a.theta), load_if_present(at, a.mass), load_if_present(at, a.volume),
+          a.gradient.pointer ? load_vector<D>(at, constant(a.gradient)) : zero_vector<V, D>(),
+          blend_varies(a) ? load_matrix<D>(at, constant(a.velocity_gradient)) : zero_matrix<V, D>()};
+}
+
+template <class At, class T, int D>
+MPM_HD void store_sums(const HeatToNodesBackwardArguments<T, D>& a, const At& at,
+                       const HeatNodesSums<typename At::Value, D>& sums) {
+  if (a.theta.pointer) store_scalar(at, a.theta, sums.theta);
+  if (a.mass.pointer) store_scalar(at, a.mass, sums.mass);
+  if (a.volume.pointer) store_scalar(at, a.volume, sums.volume);
+  if (a.gradient.pointer) store_vector<D>(at, a.gradient, sums.gradient);
+  if (blend_varies(a)) store_matrix<D>(at, a.velocity_gradient, sums.velocity_gradient);
+}
 
 // Adjoint of κ V by λ · H (θ + d) = Σ_p κ V ∇(θ + d) · ∇λ, which the equation of the solve subtracts.
 template <class V, class T, int D>
@@ -363,7 +442,8 @@ struct HeatOfDissipation {
 // the factors of the forms of the sums.
 template <class At, class T, int D>
 MPM_HD typename At::Value pull_back_surface(const HeatToNodesBackwardArguments<T, D>& a, const At& at, int scene,
-                                            const typename At::Value& volume, const typename At::Value& dt) {
+                                            const typename At::Value& volume, const typename At::Value& dt,
+                                            HeatNodesSums<typename At::Value, D>& sums) {
   using V = typename At::Value;
   using Dissipation = Applied<HeatOfDissipation, D>;
   const HeatSurfaceArguments<T, D>& f = a.surface;
@@ -390,7 +470,7 @@ MPM_HD typename At::Value pull_back_surface(const HeatToNodesBackwardArguments<T
     power = power + out[0];
     Dissipation::pull_back(in, adjoint, [](int) { return true; }, [&](int n, const V& sum) { grad[n] = sum; });
     store_scalar(at, a.dissipated, V(T(f.share)) * grad[0]);
-    add_scalar(at, a.volume, grad[1]);
+    sums.volume = sums.volume + grad[1];
     add_scalar(at, a.dt, grad[2]);
   }
   store_scalar(at, entry(a.surface_value, 0), power);
@@ -399,28 +479,17 @@ MPM_HD typename At::Value pull_back_surface(const HeatToNodesBackwardArguments<T
   return by_volume;
 }
 
-// Adjoints of what P2G adds to the sums of the nodes: those of θ and its gradient are added, and the forms set; returns
-// those of the heat capacity and of β.
-template <class At, class T, int D>
-MPM_HD HeatWeights<typename At::Value> pull_back_sums(
-    const HeatToNodesBackwardArguments<T, D>& a, const At& at, const HeatWeights<typename At::Value>& weights,
-    const HeatGathered<typename At::Value, D, kHeatChannels>& gathered, HeatForms<typename At::Value, D>& forms) {
-  using V = typename At::Value;
-  const HeatToNodesArguments<T, D>& f = a.forward;
-  const bool affine = f.particles.gradient.pointer;
-  const Vector<V, D> slope = affine ? load_vector<D>(at, f.particles.gradient) : zero_vector<V, D>();
+// Adjoints of what P2G adds to the sums of the nodes: those of θ and its gradient are added; returns those of the heat
+// capacity and of β.
+template <class V, int D>
+MPM_HD HeatWeights<V> pull_back_sums(const HeatOfParticle<V, D>& heat,
+                                     const HeatGathered<V, D, kHeatChannels>& gathered, HeatNodesSums<V, D>& sums) {
   V in[3 + D], grad[3 + D];
   Writer<V, D> arguments{in};
-  arguments.put(weights.capacity);
-  arguments.put(weights.blend);
-  arguments.put(load_scalar(at, f.particles.theta));
-  arguments.put(slope);
-  const HeatSums<V> sums = heat_sums(weights, in[2]);
-  forms.value[kHeatCapacity] = sums.capacity;
-  forms.value[kHeatVarying] = sums.varying;
-  forms.value[kHeatTheta] = sums.theta;
-  forms.value[kHeatMean] = sums.mean;
-  forms.theta = forms.mean = zero_vector<V, D>();
+  arguments.put(heat.weights.capacity);
+  arguments.put(heat.weights.blend);
+  arguments.put(heat.theta);
+  arguments.put(heat.gradient);
   pull_back(in, grad, [&](const Dual<V>(&x)[3 + D]) {
     HeatWeights<Dual<V>> w{};
     w.capacity = x[0];
@@ -436,25 +505,19 @@ MPM_HD HeatWeights<typename At::Value> pull_back_sums(
     }
     return sum;
   });
-  add_scalar(at, a.theta, grad[2]);
-  if (affine) {
-    Vector<V, D> by_slope;
-    MPM_UNROLL for (int d = 0; d < D; d++) {
-      const HeatSums<V> moment = heat_sums(weights, slope[d]);
-      forms.theta[d] = moment.theta, forms.mean[d] = moment.mean, by_slope[d] = grad[3 + d];
-    }
-    store_vector<D>(Adding<At>(at), a.gradient, by_slope);
-  }
+  sums.theta = sums.theta + grad[2];
+  MPM_UNROLL for (int d = 0; d < D; d++)
+    sums.gradient[d] = sums.gradient[d] + grad[3 + d];
   HeatWeights<V> by{};
   by.capacity = grad[0];
   by.blend = grad[1];
   return by;
 }
 
-// Adjoints of the rest volume, and of J or F, by the present volume.
+// Adjoints of J or F by the present volume; returns that of the rest volume.
 template <class At, class T, int D>
-MPM_HD void pull_back_volume(const HeatToNodesBackwardArguments<T, D>& a, const At& at,
-                             const typename At::Value& by_volume) {
+MPM_HD typename At::Value pull_back_volume(const HeatToNodesBackwardArguments<T, D>& a, const At& at,
+                                           const typename At::Value& by_volume) {
   using V = typename At::Value;
   V ratio(1);  // of the present volume to that at rest
   Matrix<V, D> by_F = zero_matrix<V, D>();
@@ -468,49 +531,41 @@ MPM_HD void pull_back_volume(const HeatToNodesBackwardArguments<T, D>& a, const 
     by_F = by_ratio * cofactor(F);
   }
   if (a.F_term.pointer) store_matrix<D>(at, a.F_term, by_F);
-  add_scalar(at, a.volume, ratio * by_volume);
+  return ratio * by_volume;
 }
 
-// At particles inside the grid, from the adjoints of the sums and the gradients; returns the forms.
+// At particles inside the grid, from the adjoints of the sums and the gradients; completes the forms.
 template <class At, class T, int D>
-MPM_HD HeatForms<typename At::Value, D> heat_of_nodes_backward(
-    const HeatToNodesBackwardArguments<T, D>& a, const At& at, int scene, const typename At::Value& dt,
-    const HeatGathered<typename At::Value, D, kHeatChannels>& gathered,
-    const HeatGradients<typename At::Value, D>& gradients) {
+MPM_HD void heat_of_nodes_backward(const HeatToNodesBackwardArguments<T, D>& a, const At& at, int scene,
+                                   const HeatOfParticle<typename At::Value, D>& heat,
+                                   const HeatGathered<typename At::Value, D, kHeatChannels>& gathered,
+                                   const HeatGradients<typename At::Value, D>& gradients,
+                                   HeatForms<typename At::Value, D>& forms) {
   using V = typename At::Value;
   const HeatToNodesArguments<T, D>& f = a.forward;
-  const V volume = load_scalar(at, f.particles.volume), dx(f.topology.geometry.dx);
-  const Matrix<V, D> L = load_matrix<D>(at, f.velocity_gradient);
-  const V in[] = {volume,
-                  load_value(at, f.specific_heat, scene),
-                  load_value(at, f.conductivity, scene),
-                  load_scalar(at, f.mass),
-                  dt,
-                  strain_rate_of(L)};
+  const V volume = heat.in[0], dt = heat.in[4], dx(f.topology.geometry.dx);
   V grad[6];
-  HeatWeights<V> weights = heat_weights(in[0], in[1], in[2], in[3], in[4], in[5], dx);
-  weights.blend = blend_of(f.transfer, weights.blend);
-
-  HeatForms<V, D> forms;
-  HeatWeights<V> by = pull_back_sums(a, at, weights, gathered, forms);
+  HeatNodesSums<V, D> sums = load_sums(a, at);
+  const Matrix<V, D> L = load_matrix<D>(at, f.velocity_gradient);
+  HeatWeights<V> by = pull_back_sums(heat, gathered, sums);
   by.blend = by.blend + load_scalar(at, a.blend);
   const V by_rest = pull_back_conduction(a, load_scalar(at, constant(f.conductance)), gradients, forms);
   by.conductance = a.conductance.pointer ? load_scalar(at, a.conductance) : by_rest;
-  const V by_volume = a.surface_value.pointer ? pull_back_surface(a, at, scene, volume, dt) : V(0);
-  if (a.rate.pointer) add_scalar(at, a.dt, weights.capacity * load_scalar(at, a.rate));
-  const bool varies = f.transfer == HeatTransfer::hybrid;  // else β is constant
-  pull_back(in, grad, [&](const Dual<V>(&x)[6]) {
+  const V by_volume = a.surface_value.pointer ? pull_back_surface(a, at, scene, volume, dt, sums) : V(0);
+  const bool varies = blend_varies(a);
+  pull_back(heat.in, grad, [&](const Dual<V>(&x)[6]) {
     const HeatWeights<Dual<V>> w = heat_weights(x[0], x[1], x[2], x[3], x[4], x[5], Dual<V>(dx, V(0)));
     const V sum = by.capacity * w.capacity.derivative + by.conductance * w.conductance.derivative;
     return varies ? sum + by.blend * w.blend.derivative : sum;
   });
-  pull_back_volume(a, at, by_volume + grad[0]);
+  sums.volume = sums.volume + pull_back_volume(a, at, by_volume + grad[0]);
+  sums.mass = sums.mass + grad[3];
+  if (varies) sums.velocity_gradient = sums.velocity_gradient + grad[5] * strain_rate_slope(L);
+  store_sums(a, at, sums);
   add_parameter(at, a.parameters, kSpecificHeat, grad[1]);
   add_parameter(at, a.parameters, kConductivity, grad[2]);
-  add_scalar(at, a.mass, grad[3]);
+  if (a.rate.pointer) add_scalar(at, a.dt, heat.weights.capacity * load_scalar(at, a.rate));
   add_scalar(at, a.dt, grad[4]);
-  if (varies) store_matrix<D>(Adding<At>(at), a.velocity_gradient, grad[5] * strain_rate_slope(L));
-  return forms;
 }
 
 // A particle outside the grid takes no part.

@@ -148,6 +148,9 @@ MPM_HD MotionAdjoint<T, D> advance_particle_backward(const AdvanceBackwardArgume
   Vector<T, D> v;
   Matrix<T, D> C;
   load_motion(a.forward, at, v, C);
+  // Present values are loaded before any is stored, as in lanes.h.
+  const Vector<T, D> velocity = a.adds_velocity ? load_vector<D>(at, constant(a.velocity)) : zero_vector<T, D>();
+  const Matrix<T, D> affine = a.adds_affine ? load_matrix<D>(at, constant(a.affine)) : zero_matrix<T, D>();
   MotionAdjoint<T, D> motion{dt * grad_x, zero_matrix<T, D>()};
   T grad_dt = dot(v, grad_x);
   if (a.forward.F.pointer) {
@@ -163,9 +166,9 @@ MPM_HD MotionAdjoint<T, D> advance_particle_backward(const AdvanceBackwardArgume
       motion.affine[i][i] = motion.affine[i][i] + dt * J * g;
     grad_dt = grad_dt + rate * J * g;
   }
-  if (a.adds_velocity) motion.velocity = load_vector<D>(at, constant(a.velocity)) + motion.velocity;
+  motion.velocity = velocity + motion.velocity;
   if (a.velocity.pointer) store_vector<D>(at, a.velocity, motion.velocity);
-  if (a.adds_affine) motion.affine = load_matrix<D>(at, constant(a.affine)) + motion.affine;
+  motion.affine = affine + motion.affine;
   if (a.affine.pointer) store_matrix<D>(at, a.affine, motion.affine);
   if (a.dt.pointer) store_scalar(at, a.dt, grad_dt);
   return motion;

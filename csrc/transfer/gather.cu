@@ -130,9 +130,13 @@ struct FieldPositionGradient {
     for (int i = 0; i < D; i++) r[i] = inverse_dx * s.slope[i];
     return r;
   }
+  // Present values are loaded before any is stored, as in common/lanes.h.
   __device__ void write(int p, const Loaded&, const Result& r) const {
+    Result sum = r;
 #pragma unroll
-    for (int i = 0; i < D; i++) out.at(p, i) = adds ? out.at(p, i) + r[i] : r[i];
+    for (int i = 0; i < D; i++) sum[i] = adds ? out.at(p, i) + r[i] : r[i];
+#pragma unroll
+    for (int i = 0; i < D; i++) out.at(p, i) = sum[i];
   }
   __device__ void skip(int p) const { write(p, {}, {}); }
 };
@@ -216,16 +220,21 @@ struct MomentumAdjoint {
     return r;
   }
   template <int N>
-  __device__ void write(const Columns<T, N>& sum, int p, int k, const T& value) const {
-    if (sum.present()) sum.at(p, k) = adds ? sum.at(p, k) + value : value;
+  __device__ T sum(const Columns<T, N>& to, int p, int k, const T& value) const {
+    return adds && to.present() ? to.at(p, k) + value : value;
   }
+  // Present values are loaded before any is stored, as in common/lanes.h.
   __device__ void write(int p, const Loaded&, const Result& r) const {
-    write(mass, p, 0, r.particle.mass);
-    write(volume, p, 0, r.particle.volume);
+    const T by_mass = sum(mass, p, 0, r.particle.mass), by_volume = sum(volume, p, 0, r.particle.volume);
+    mpm::Vector<T, D> by_x;
+#pragma unroll
+    for (int i = 0; i < D; i++) by_x[i] = sum(x, p, i, r.x[i]);
+    mass.write(p, 0, by_mass);
+    volume.write(p, 0, by_volume);
     dt.write(p, 0, r.particle.dt);
 #pragma unroll
     for (int i = 0; i < D; i++) {
-      write(x, p, i, r.x[i]);
+      x.write(p, i, by_x[i]);
       velocity.write(p, i, r.particle.velocity[i]);
 #pragma unroll
       for (int j = 0; j < D; j++) {
