@@ -40,6 +40,7 @@ struct SimpleKernel {
   __device__ T* product() const { return a.product[a.step]; }
 };
 
+// Of all scenes: a later product may be of those that these steps do not solve.
 template <int Order, class T, int D>
 __global__ void __launch_bounds__(kPackThreads) pack_kernel(const __grid_constant__ SimpleKernel<Order, T, D> k) {
   using S = typename SimpleKernel<Order, T, D>::S;
@@ -50,7 +51,6 @@ __global__ void __launch_bounds__(kPackThreads) pack_kernel(const __grid_constan
   const int count = k.items();
   for (int i = blockIdx.x; i < count; i += gridDim.x) {
     const Item item = k.item(i);
-    if (k.steps_of(item) == 0) continue;
     int particle[kEachPacked], cell[kEachPacked], rank[kEachPacked];
     PackedParticle<T, D> q[kEachPacked];
     Vector<T, D> x[kEachPacked];
@@ -93,7 +93,7 @@ __global__ void __launch_bounds__(kProductThreads)
   __shared__ WarpMemory<S> memory[kProductWarps];
   const int count = k.items(), warp = int(threadIdx.x) / 32;
   for (int i = int(blockIdx.x) * kProductWarps + warp; i < count; i += int(gridDim.x) * kProductWarps)
-    if (k.steps_of(k.item(i)) > 0) pack_item<S>(k.topology(), k.x, k.conductance, k.item(i), i, k.packed, memory[warp]);
+    pack_item<S>(k.topology(), k.x, k.conductance, k.item(i), i, k.packed, memory[warp]);
 }
 
 // Directions of a step of a scene.

@@ -13,6 +13,7 @@ unsigned blocks_for(int64_t count) { return unsigned((count + kThreads - 1) / kT
 // One thread adds the same element of all addends, so that two may have the same sum.
 template <class T, int D>
 __global__ void __launch_bounds__(kThreads) accumulate_kernel(const AccumulateArguments<T, D> a) {
+  grid_dependency_sync();
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   for (int k = 0; k < a.addends; k++)
     if (i < a.addend[k].size) a.addend[k].sum[i] += a.addend[k].term[i];
@@ -50,7 +51,7 @@ __global__ void __launch_bounds__(kThreads) accumulate_slots_kernel(const Accumu
 
 template <class T, int D>
 void accumulate(const AccumulateArguments<T, D>& a, Stream stream) {
-  if (a.longest > 0) launch(accumulate_kernel<T, D>, blocks_for(a.longest), kThreads, 0, stream, a);
+  if (a.longest > 0) launch_in_chain(accumulate_kernel<T, D>, blocks_for(a.longest), kThreads, 0, stream, a);
 }
 
 template <class T, int D>

@@ -7,6 +7,14 @@
 // Adjoint of the conduction of heat in the steps of a record, the last step first.
 namespace mpm {
 
+// Bytes of nodes that a backward pass clears at once, those of several steps, to save launches.
+constexpr int64_t kCleared = 1 << 26;
+
+// Steps of such nodes, of `bytes` each.
+inline int64_t cleared_at_once(int64_t bytes, int64_t steps) {
+  return std::clamp<int64_t>(kCleared / std::max<int64_t>(bytes, 1), 1, steps);
+}
+
 // Adjoints of the heat of the particles, and sums of other adjoints that it adds to; absent ones are undefined.
 struct HeatAdjoints {
   Tensor state;       // [P, m] in the order of the record
@@ -29,7 +37,7 @@ class HeatBackward {
   void run(int64_t i, const HeatAdjoints& adjoints) {
     const HeatSolution<T, D> solution = record_.conduct_again(i);
     make_nodes(solution);
-    backend::clear(zero_, stream_);
+    use_cleared(i);
     HeatToParticlesBackwardArguments<T, D> up = to_particles(solution, adjoints);
     backend::heat_to_particles_backward(order(), up, stream_);
     scatter(up);
@@ -49,6 +57,9 @@ class HeatBackward {
   // There the adjoint of P2G gathers ∇(θ + d) and ∇λ itself, and computes the position gradient of the forms.
   static constexpr bool kOnCuda = MPM_BACKEND == MPM_BACKEND_IS_cuda;
 
+  // Numbers per node that are zero when the adjoint of a step begins.
+  static constexpr int64_t kZero = kHeatSolved + 1 + kMostSimpleSteps;
+
   int64_t order() const { return in_.lattice.order(); }
   T* rows(const Tensor& t) const { return static_cast<T*>(t.data_ptr()); }
   HeatSteps<T, D>& heat() const { return *record_.heat; }
@@ -60,6 +71,7 @@ class HeatBackward {
   }
 
   void make_nodes(const HeatSolution<T, D>& solution);
+  void use_cleared(int64_t i);
   HeatToParticlesBackwardArguments<T, D> to_particles(const HeatSolution<T, D>& solution, const HeatAdjoints& adjoints);
   void scatter(const HeatToParticlesBackwardArguments<T, D>& up);
   void solve(HeatArguments<T, D> system, const Tensor& status);
@@ -81,10 +93,10 @@ class HeatBackward {
   Recorded<T, D>& record_;
   const SubstepsInputs& in_;
   backend::Stream stream_;
-  Tensor value_, moment_, blend_, rate_of_particles_;  // [P, kHeatForms], [P, kHeatForms, D], [P], [P, 1]
-  int64_t nodes_ = -1;
-  // Of the nodes: memory that is zero when the adjoint of a step begins, with the next three; the others.
-  Tensor zero_, adjoints_, product_, products_;
+  Tensor value_, moment_, blend_, rate_of_particles_;           // [P, kHeatForms], [P, kHeatForms, D], [P], [P, 1]
+  int64_t nodes_ = -1, cleared_steps_ = 1, first_cleared_ = 0;  // steps from the last one on are cleared
+  Tensor zero_;                                                 // [cleared_steps_, kZero, N], with those of a step:
+  T *adjoints_ = nullptr, *product_ = nullptr, *products_ = nullptr;
   Tensor source_, multiplier_, by_sums_, solved_, rate_;
   Tensor slot_sums_, counted_;  // of the numbers of the boundary, by slots; nodes that are held
   // Adjoints of the sums of the free surface, and of θ by the terms; [P, 1 + D], [P, 1 + D, D].
@@ -127,10 +139,9 @@ void HeatBackward<T, D>::make_nodes(const HeatSolution<T, D>& solution) {
   const int64_t nodes = int64_t(solution.system.topology.max_blocks) * kBlockNodes<D>;
   if (nodes == nodes_) return;
   nodes_ = nodes;
-  zero_ = empty(in_.x, {kHeatSolved + 1 + kMostSimpleSteps, nodes});
-  adjoints_ = torch::stable::view(torch::stable::narrow(zero_, 0, 0, kHeatSolved), {nodes, int64_t(kHeatSolved)});
-  product_ = torch::stable::narrow(zero_, 0, kHeatSolved, 1);
-  products_ = torch::stable::narrow(zero_, 0, kHeatSolved + 1, kMostSimpleSteps);
+  cleared_steps_ = kOnCuda ? cleared_at_once(kZero * nodes * int64_t(sizeof(T)), in_.n) : 1;
+  zero_ = empty(in_.x, {cleared_steps_, kZero, nodes});
+  first_cleared_ = in_.n;
   for (Tensor* t : {&multiplier_, &rate_}) *t = empty(in_.x, {nodes});
   if (!kOnCuda) source_ = empty(in_.x, {nodes});
   by_sums_ = empty(in_.x, {nodes, kHeatChannels});
@@ -138,6 +149,18 @@ void HeatBackward<T, D>::make_nodes(const HeatSolution<T, D>& solution) {
   if (heat().holds_surface()) layer_ = empty(in_.x, {nodes});
   if (heat().has_terms()) surface_ = empty(in_.x, {nodes, kHeatChannels}), by_terms_ = empty(in_.x, {nodes});
   workspace_ = Tensor();
+}
+
+// Steps are processed from the last one to the first.
+template <class T, int D>
+void HeatBackward<T, D>::use_cleared(int64_t i) {
+  if (i < first_cleared_) {
+    backend::clear(zero_, stream_);
+    first_cleared_ = i + 1 - cleared_steps_;
+  }
+  adjoints_ = rows(zero_) + (i - first_cleared_) * kZero * nodes_;
+  product_ = adjoints_ + kHeatSolved * nodes_;
+  products_ = product_ + nodes_;
 }
 
 template <class T, int D>
@@ -167,16 +190,19 @@ void HeatBackward<T, D>::scatter(const HeatToParticlesBackwardArguments<T, D>& u
   a.value = constant(forms(value_, kHeatIncrement));
   if (up.gradient.pointer) a.moment = constant(forms(moment_, kHeatIncrement));
   a.deterministic = in_.lattice.deterministic();
-  a.nodes = {rows(adjoints_), kHeatSolved, kOnCuda ? kHeatSolved : 2};
+  a.nodes = {adjoints_, kHeatSolved, kOnCuda ? kHeatSolved : 2};
   backend::scatter(order(), a, stream_);
-  if (!kOnCuda) torch::stable::copy_(source_, torch::stable::select(adjoints_, 1, kIncrementAdjoint));
+  if (kOnCuda) return;
+  torch::stable::copy_(
+      source_, torch::stable::from_blob(adjoints_ + kIncrementAdjoint, Shape{nodes_}, Shape{int64_t(kHeatSolved)},
+                                        in_.x.device(), in_.x.scalar_type()));
 }
 
 // λ of A λ = adjoint of the increment.
 template <class T, int D>
 void HeatBackward<T, D>::solve(HeatArguments<T, D> system, const Tensor& status) {
   system.theta = nullptr;
-  system.source = kOnCuda ? rows(adjoints_) + kIncrementAdjoint : rows(source_);
+  system.source = kOnCuda ? adjoints_ + kIncrementAdjoint : rows(source_);
   system.source_stride = kOnCuda ? kHeatSolved : 1;
   system.tolerance = 0;
   system.relative_tolerance = in_.heat_scalars[3];
@@ -188,7 +214,7 @@ void HeatBackward<T, D>::solve(HeatArguments<T, D> system, const Tensor& status)
   system.workspace = workspace_.data_ptr();
   HeatFinishArguments<T, D> finish;
   finish.simple.solve = system;
-  for (int k = 0; k < kMostSimpleSteps; k++) finish.simple.product[k] = rows(products_) + k * nodes_;
+  for (int k = 0; k < kMostSimpleSteps; k++) finish.simple.product[k] = products_ + k * nodes_;
   finish.increment = system.increment;
   finish.status = static_cast<double*>(status.data_ptr());
   solve_simply(order(), finish, stream_);
@@ -203,7 +229,8 @@ void HeatBackward<T, D>::multiply(HeatArguments<T, D> system) {
   system.workspace = workspace_.data_ptr();
   HeatSimpleArguments<T, D> a;
   a.solve = system;
-  a.product[0] = rows(product_);
+  a.packed = true;  // by the solve
+  a.product[0] = product_;
   backend::heat_simple_step(order(), a, stream_);
 }
 
@@ -241,7 +268,7 @@ void HeatBackward<T, D>::adjoint_of_boundaries(const HeatSolution<T, D>& solutio
   }
   for (int64_t k = 0; k < heat().held_nodes(); k++, to.first++)
     backend::heat_held_backward(
-        HeatHeldBackwardArguments<T, D>{heat().hold(k, solution.system.heat_capacity), rows(adjoints_), rows(product_),
+        HeatHeldBackwardArguments<T, D>{heat().hold(k, solution.system.heat_capacity), adjoints_, product_,
                                         static_cast<bool*>(counted_.data_ptr()), to},
         stream_);
   if (heat().holds_surface()) adjoint_of_surface_temperature(solution, to);
@@ -272,8 +299,8 @@ void HeatBackward<T, D>::adjoint_of_nodes(const HeatSolution<T, D>& solution, bo
   a.sums = solution.down.sums.pointer;
   a.theta = solution.theta;
   a.multiplier = rows(multiplier_);
-  a.product = rows(product_);
-  a.adjoints = rows(adjoints_);
+  a.product = product_;
+  a.adjoints = adjoints_;
   a.exchange = solution.system.exchange;
   if (heat().has_terms()) a.by_terms = rows(by_terms_);
   a.fixed = solution.system.fixed;

@@ -58,7 +58,7 @@ class SubstepsBackward {
   void run(Adjoints& adjoints, const GridSums& sums) {
     if (!recorded_) check_room(r_.run());
     const int64_t slots = s_.activation.slots(), rows = slots * kBlockNodes<D>;
-    motions_ = std::clamp<int64_t>(kCleared / std::max<int64_t>(rows * (1 + D) * int64_t(sizeof(T)), 1), 1, in_.n);
+    motions_ = cleared_at_once(rows * (1 + D) * int64_t(sizeof(T)), in_.n);
     motion_ = empty(in_.x, {motions_, rows, 1 + D});
     update_ = empty(in_.x, {rows, 1 + D});
     if (s_.obstacles) contact_ = empty(in_.x, {rows, 1 + D});
@@ -140,7 +140,6 @@ class SubstepsBackward {
   Tensor stress_, F_term_, parameters_term_;
   Tensor motion_dt_, stress_dt_;  // of the end of a step, and of P2G [P]
   Tensor gradient_;  // velocity gradient that moves F and J, if that is not the affine field; or its adjoint
-  static constexpr int64_t kCleared = 1 << 26;  // bytes cleared at once, to save launches
   int64_t motions_ = 1;
   // Adjoints on the nodes [N, 1 + D]: of their motion in several steps, before contact, and before the grid update; and
   // of the velocity change by gravity, by slots.

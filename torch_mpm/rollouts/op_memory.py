@@ -33,7 +33,7 @@ from .steps import Steps
 STEPS_OF_A_CALL = {"cpu": 8.0, "cuda": 64.0}
 """Time of a call of the op beside its steps, in steps."""
 _CLEARED = 1 << 26
-"""Bytes of node adjoints that the backward pass clears at once, `kCleared` in substeps_backward.op.cpp."""
+"""Bytes of nodes that the backward pass clears at once, `kCleared` in csrc/rollout/heat_backward.h."""
 _SIMPLE_STEPS = 3
 """`kMostSimpleSteps` in csrc/heat/solve.h."""
 
@@ -108,7 +108,15 @@ class _Sizes:
         """The record of a step, and the adjoints of its nodes [bytes]."""
         grid = 0 if self._grid_is_shared() else self._grid_bytes()
         of_scenes = (1 + self._step.grid.scenes) * 48
-        return self._rows(self._recorded_columns()) + grid + of_scenes + min(self._node_rows(), _CLEARED)
+        return self._rows(self._recorded_columns()) + grid + of_scenes + self._cleared_nodes()
+
+    def _cleared_nodes(self) -> int:
+        """Adjoints of the nodes of a step that are cleared with those of other steps: of the motion, and of heat on
+        CUDA [bytes]."""
+        motion = min(self._node_rows(), _CLEARED)
+        if self._heat is None or not self._cuda:
+            return motion
+        return motion + min(self._nodes() * (4 + 1 + _SIMPLE_STEPS) * self._size, _CLEARED)
 
     def _recorded_columns(self) -> int:
         step, heat = self._step, self._heat
