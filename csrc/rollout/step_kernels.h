@@ -192,7 +192,6 @@ struct Substeps {
   // second P2G and gather use the blocks of the activation only.
   void let_activations_last(backend::Stream stream) {
     if (MPM_BACKEND == MPM_BACKEND_IS_cpu || (in.lattice.deterministic() && !sums_are_fixed(facts)) || flips()) return;
-    if (!in.heat.empty() && !in.resident) return;  // the solver of heat needs all particles in their base blocks
     if (sums_are_fixed(facts)) fix_sums(stream);
     displacements = empty_int(in.x, {2, sizeof(Displacement) / sizeof(int)});
     torch::stable::zero_(displacements);

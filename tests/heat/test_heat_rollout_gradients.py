@@ -170,6 +170,15 @@ def test_many_particles_in_a_cell(conductivity, checkpoint, device):
     compare(step, state, 3, tolerance=1e-8, checkpoint=checkpoint)
 
 
+@pytest.mark.parametrize("law", ["neo_hookean", "wax"])
+@pytest.mark.parametrize("conductivity", [2e3, 2e6])
+def test_particles_that_leave_their_base_blocks(law, conductivity, dim, device):
+    """By 1.2 cells in one call, in which activations last on CUDA. Those of recomputed steps do not."""
+    step, state = tempered(law, dim, device=device) if law in THERMAL else scene(dim, law=law, device=device)
+    step.heat.conductivity = conductivity
+    compare(step, state.replace(v=state.v + 25.0), 24, tolerance=1e-8, checkpoint=24)
+
+
 @pytest.mark.parametrize(
     *in_pairs(
         boundary=["none", "nodes", "surface", "terms", "plastic"], melts=[False, True], transfer=TRANSFERS, dim=[2, 3],
