@@ -93,9 +93,11 @@ class HeatBackward {
   Recorded<T, D>& record_;
   const SubstepsInputs& in_;
   backend::Stream stream_;
-  Tensor value_, moment_, blend_, rate_of_particles_;           // [P, kHeatForms], [P, kHeatForms, D], [P], [P, 1]
-  int64_t nodes_ = -1, cleared_steps_ = 1, first_cleared_ = 0;  // steps from the last one on are cleared
-  Tensor zero_;                                                 // [cleared_steps_, kZero, N], with those of a step:
+  Tensor value_, moment_, blend_, rate_of_particles_;  // [P, kHeatForms], [P, kHeatForms, D], [P], [P, 1]
+  int64_t nodes_ = -1;
+  // Memory of nodes that is cleared for several steps, from the first one on, [steps, kZero, N]; of the present step.
+  Tensor zero_;
+  int64_t cleared_steps_ = 1, first_cleared_ = 0;
   T *adjoints_ = nullptr, *product_ = nullptr, *products_ = nullptr;
   Tensor source_, multiplier_, by_sums_, solved_, rate_;
   Tensor slot_sums_, counted_;  // of the numbers of the boundary, by slots; nodes that are held
