@@ -129,7 +129,7 @@ struct HeatToNodesPullBack {
   }
 
  private:
-  // Of the forms of G2P.
+  // Factors of the forms of G2P.
   __device__ Factors load_factors(const One<T>& at) const {
     Factors f;
 #pragma unroll
@@ -142,7 +142,7 @@ struct HeatToNodesPullBack {
     }
     return f;
   }
-  // The adjoints of the sums; returns the slope of the forms of P2G, per cell.
+  // Gathers the adjoints of the sums. Returns the slope of the forms of P2G per cell.
   template <class Support>
   __device__ Vector<T, D> sum(const Weights<Order, T, D>& w, const Support& support, const HeatForms<T, D>& forms,
                               HeatGathered<T, D, K>& gathered) const {
@@ -176,7 +176,7 @@ struct HeatToNodesPullBack {
     }
     return g;
   }
-  // Per cell, with the sums of its shape.
+  // Slope of forms per cell. The sums of the shape are set, too.
   template <class Support, class S>
   __device__ Vector<T, D> slope(const Weights<Order, T, D>& w, const Support& support, const Factors& f,
                                 Sums<S>& sums) const {

@@ -281,6 +281,8 @@ struct HeatOfParticle {
   V theta;
   Vector<V, D> gradient;  // zero where particles have none
 
+  MPM_HD const V& volume() const { return in[0]; }
+  MPM_HD const V& dt() const { return in[4]; }
   // The forms of P2G.
   MPM_HD HeatForms<V, D> forms() const {
     HeatForms<V, D> f{};
@@ -322,7 +324,7 @@ struct HeatGradients {
 // Adjoints to which the adjoint of P2G adds, zero where they are absent. They are loaded with the inputs of a particle,
 // before any of them is stored, as in lanes.h.
 template <class V, int D>
-struct HeatNodesSums {
+struct AddedAdjoints {
   V theta, mass, volume;
   Vector<V, D> gradient;
   Matrix<V, D> velocity_gradient;
@@ -340,7 +342,7 @@ MPM_HD typename At::Value load_if_present(const At& at, const Field<T>& f) {
 }
 
 template <class At, class T, int D>
-MPM_HD HeatNodesSums<typename At::Value, D> load_sums(const HeatToNodesBackwardArguments<T, D>& a, const At& at) {
+MPM_HD AddedAdjoints<typename At::Value, D> load_sums(const HeatToNodesBackwardArguments<T, D>& a, const At& at) {
   using V = typename At::Value;
   return {load_if_present(at, a.theta), load_if_present(at, a.mass), load_if_present(at, a.volume),
           a.gradient.pointer ? load_vector<D>(at, constant(a.gradient)) : zero_vector<V, D>(),
@@ -349,7 +351,7 @@ MPM_HD HeatNodesSums<typename At::Value, D> load_sums(const HeatToNodesBackwardA
 
 template <class At, class T, int D>
 MPM_HD void store_sums(const HeatToNodesBackwardArguments<T, D>& a, const At& at,
-                       const HeatNodesSums<typename At::Value, D>& sums) {
+                       const AddedAdjoints<typename At::Value, D>& sums) {
   if (a.theta.pointer) store_scalar(at, a.theta, sums.theta);
   if (a.mass.pointer) store_scalar(at, a.mass, sums.mass);
   if (a.volume.pointer) store_scalar(at, a.volume, sums.volume);
@@ -443,7 +445,7 @@ struct HeatOfDissipation {
 template <class At, class T, int D>
 MPM_HD typename At::Value pull_back_surface(const HeatToNodesBackwardArguments<T, D>& a, const At& at, int scene,
                                             const typename At::Value& volume, const typename At::Value& dt,
-                                            HeatNodesSums<typename At::Value, D>& sums) {
+                                            AddedAdjoints<typename At::Value, D>& sums) {
   using V = typename At::Value;
   using Dissipation = Applied<HeatOfDissipation, D>;
   const HeatSurfaceArguments<T, D>& f = a.surface;
@@ -483,7 +485,7 @@ MPM_HD typename At::Value pull_back_surface(const HeatToNodesBackwardArguments<T
 // capacity and of β.
 template <class V, int D>
 MPM_HD HeatWeights<V> pull_back_sums(const HeatOfParticle<V, D>& heat,
-                                     const HeatGathered<V, D, kHeatChannels>& gathered, HeatNodesSums<V, D>& sums) {
+                                     const HeatGathered<V, D, kHeatChannels>& gathered, AddedAdjoints<V, D>& sums) {
   V in[3 + D], grad[3 + D];
   Writer<V, D> arguments{in};
   arguments.put(heat.weights.capacity);
@@ -534,7 +536,7 @@ MPM_HD typename At::Value pull_back_volume(const HeatToNodesBackwardArguments<T,
   return ratio * by_volume;
 }
 
-// At particles inside the grid, from the adjoints of the sums and the gradients; completes the forms.
+// Adjoint of P2G at a particle inside the grid, from the adjoints of the sums and the gradients. Completes the forms.
 template <class At, class T, int D>
 MPM_HD void heat_of_nodes_backward(const HeatToNodesBackwardArguments<T, D>& a, const At& at, int scene,
                                    const HeatOfParticle<typename At::Value, D>& heat,
@@ -543,9 +545,9 @@ MPM_HD void heat_of_nodes_backward(const HeatToNodesBackwardArguments<T, D>& a, 
                                    HeatForms<typename At::Value, D>& forms) {
   using V = typename At::Value;
   const HeatToNodesArguments<T, D>& f = a.forward;
-  const V volume = heat.in[0], dt = heat.in[4], dx(f.topology.geometry.dx);
+  const V volume = heat.volume(), dt = heat.dt(), dx(f.topology.geometry.dx);
   V grad[6];
-  HeatNodesSums<V, D> sums = load_sums(a, at);
+  AddedAdjoints<V, D> sums = load_sums(a, at);
   const Matrix<V, D> L = load_matrix<D>(at, f.velocity_gradient);
   HeatWeights<V> by = pull_back_sums(heat, gathered, sums);
   by.blend = by.blend + load_scalar(at, a.blend);

@@ -29,7 +29,7 @@ struct SimpleKernel {
 
   explicit SimpleKernel(const HeatSimpleArguments<T, D>& a)
       : a(a),
-        packed(packed_in(a.solve.workspace, a.solve.topology, a.solve.deterministic)),
+        packed(packed_in(a.workspace ? a.workspace : a.solve.workspace, a.solve.topology, a.solve.deterministic)),
         x(a.solve.x),
         conductance(a.solve.conductance) {}
 
@@ -37,10 +37,10 @@ struct SimpleKernel {
   __device__ Item item(int i) const { return reinterpret_cast<const Item*>(schedule_of(topology()).items)[i]; }
   __device__ int items() const { return *schedule_of(topology()).item_count; }
   __device__ int steps_of(const Item& item) const { return simple_steps(a.solve, scene_of(topology(), item.block)); }
+  __device__ bool packs(const Item& item) const { return a.workspace || steps_of(item) > 0; }
   __device__ T* product() const { return a.product[a.step]; }
 };
 
-// Of all scenes: a later product may be of those that these steps do not solve.
 template <int Order, class T, int D>
 __global__ void __launch_bounds__(kPackThreads) pack_kernel(const __grid_constant__ SimpleKernel<Order, T, D> k) {
   using S = typename SimpleKernel<Order, T, D>::S;
@@ -51,6 +51,7 @@ __global__ void __launch_bounds__(kPackThreads) pack_kernel(const __grid_constan
   const int count = k.items();
   for (int i = blockIdx.x; i < count; i += gridDim.x) {
     const Item item = k.item(i);
+    if (!k.packs(item)) continue;
     int particle[kEachPacked], cell[kEachPacked], rank[kEachPacked];
     PackedParticle<T, D> q[kEachPacked];
     Vector<T, D> x[kEachPacked];
@@ -93,7 +94,7 @@ __global__ void __launch_bounds__(kProductThreads)
   __shared__ WarpMemory<S> memory[kProductWarps];
   const int count = k.items(), warp = int(threadIdx.x) / 32;
   for (int i = int(blockIdx.x) * kProductWarps + warp; i < count; i += int(gridDim.x) * kProductWarps)
-    pack_item<S>(k.topology(), k.x, k.conductance, k.item(i), i, k.packed, memory[warp]);
+    if (k.packs(k.item(i))) pack_item<S>(k.topology(), k.x, k.conductance, k.item(i), i, k.packed, memory[warp]);
 }
 
 // Directions of a step of a scene.

@@ -65,7 +65,9 @@ struct HeatSimpleArguments {
   T* product[kMostSimpleSteps]{};  // [N] H θ, and H (M/dt + X)⁻¹ r after each step but the last; zero on entry on CUDA,
                                    // and without θ the first one
   int step = 0;                    // number of the product
-  bool packed = false;             // whether the particles are in the work space already
+  void* workspace = nullptr;       // on CUDA, of the packed particles of all scenes; absent: that of the solve, with
+                                   // those of the scenes of these steps
+  bool packed = false;             // whether the particles are packed already
 };
 
 // H u, or the diagonal of H where u is absent.

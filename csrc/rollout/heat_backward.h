@@ -10,7 +10,7 @@ namespace mpm {
 // Bytes of nodes that a backward pass clears at once, those of several steps, to save launches.
 constexpr int64_t kCleared = 1 << 26;
 
-// Steps of such nodes, of `bytes` each.
+// Number of steps whose nodes, of `bytes` each, are cleared at once.
 inline int64_t cleared_at_once(int64_t bytes, int64_t steps) {
   return std::clamp<int64_t>(kCleared / std::max<int64_t>(bytes, 1), 1, steps);
 }
@@ -63,6 +63,8 @@ class HeatBackward {
   int64_t order() const { return in_.lattice.order(); }
   T* rows(const Tensor& t) const { return static_cast<T*>(t.data_ptr()); }
   HeatSteps<T, D>& heat() const { return *record_.heat; }
+  // Memory of packed particles that the adjoint solve leaves as they are: that of the solves of the steps.
+  void* packed() const { return kOnCuda ? heat().workspace(stream_) : nullptr; }
   // Forms from `first` on.
   static Field<T> forms(const Tensor& t, int first) {
     Field<T> f = field<T>(t);
@@ -95,9 +97,9 @@ class HeatBackward {
   backend::Stream stream_;
   Tensor value_, moment_, blend_, rate_of_particles_;  // [P, kHeatForms], [P, kHeatForms, D], [P], [P, 1]
   int64_t nodes_ = -1;
-  // Memory of nodes that is cleared for several steps, from the first one on, [steps, kZero, N]; of the present step.
-  Tensor zero_;
+  Tensor zero_;  // nodes of several steps, cleared at once [cleared_steps_, kZero, N]
   int64_t cleared_steps_ = 1, first_cleared_ = 0;
+  // Parts of the present step: adjoints of the nodes, H λ, and products of the solve.
   T *adjoints_ = nullptr, *product_ = nullptr, *products_ = nullptr;
   Tensor source_, multiplier_, by_sums_, solved_, rate_;
   Tensor slot_sums_, counted_;  // of the numbers of the boundary, by slots; nodes that are held
@@ -106,7 +108,7 @@ class HeatBackward {
   // Of a held surface: adjoint of the exchange of the nodes, and gathered [P, 1]; of κ V [P], of x [P, D], and of the
   // distance [P]; of the row of its obstacle, by slots.
   Tensor layer_, layer_exchange_, layer_of_particles_, by_conductance_, x_layer_, by_distance_, row_sums_;
-  Tensor no_bound_;  // [B], of the spectrum
+  Tensor no_bound_;  // [B], bounds of zero, for `multiply`
   Tensor iterations_, residual_, converged_, workspace_;
 };
 
@@ -216,13 +218,15 @@ void HeatBackward<T, D>::solve(HeatArguments<T, D> system, const Tensor& status)
   system.workspace = workspace_.data_ptr();
   HeatFinishArguments<T, D> finish;
   finish.simple.solve = system;
+  finish.simple.workspace = packed();
   for (int k = 0; k < kMostSimpleSteps; k++) finish.simple.product[k] = products_ + k * nodes_;
   finish.increment = system.increment;
   finish.status = static_cast<double*>(status.data_ptr());
   solve_simply(order(), finish, stream_);
 }
 
-// H λ: the first product of the simple steps, with λ in place of θ; with a bound of zero every scene takes that step.
+// H λ: the first product of the simple steps, with λ in place of θ. With a bound of zero every scene takes that step.
+// The particles are those that `solve` has packed.
 template <class T, int D>
 void HeatBackward<T, D>::multiply(HeatArguments<T, D> system) {
   system.theta = rows(multiplier_);
@@ -231,7 +235,8 @@ void HeatBackward<T, D>::multiply(HeatArguments<T, D> system) {
   system.workspace = workspace_.data_ptr();
   HeatSimpleArguments<T, D> a;
   a.solve = system;
-  a.packed = true;  // by the solve
+  a.workspace = packed();
+  a.packed = true;
   a.product[0] = product_;
   backend::heat_simple_step(order(), a, stream_);
 }

@@ -170,6 +170,9 @@ class HeatSteps {
     return {to_nodes(x, mass, velocity_gradient), equations(x), nodes_.theta};
   }
 
+  // Work space of the solves of the steps.
+  void* workspace(backend::Stream stream);
+
   // The transfer of these temperatures to the particles, to the other buffer of the fields or in place.
   HeatToParticlesArguments<T, D> to_particles(const HeatToNodesArguments<T, D>& down, bool elsewhere);
 
@@ -253,7 +256,6 @@ class HeatSteps {
   int64_t used_slots() const { return s_.activation.used_slots ? s_.used_slots : s_.activation.slots(); }
   void make_nodes(backend::Stream stream);
   void make_own_nodes(backend::Stream stream);
-  void* workspace(backend::Stream stream);
   HeatToNodesArguments<T, D> to_nodes(const Field<const T>& x, const Field<const T>& mass,
                                       const Field<const T>& velocity_gradient) const;
   HeatArguments<T, D> equations(const Field<const T>& x) const;
@@ -643,7 +645,6 @@ HeatArguments<T, D> HeatSteps<T, D>::equations(const Field<const T>& x) const {
   return a;
 }
 
-// Of the solves.
 template <class T, int D>
 void* HeatSteps<T, D>::workspace(backend::Stream stream) {
   HeatArguments<T, D> a;

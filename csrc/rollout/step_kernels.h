@@ -188,10 +188,12 @@ struct Substeps {
   }
 
   // On CUDA an activation may serve several substeps: blocks around those with particles are active too, and G2P
-  // detects when they no longer suffice. Exceptions: sums with an order, which is that of whole blocks, and FLIP, whose
-  // second P2G and gather use the blocks of the activation only.
+  // detects when they no longer suffice. Exceptions: sums with an order, which is that of whole blocks; FLIP, whose
+  // second P2G and gather use the blocks of the activation only; and gradients through a pool that does not grow, since
+  // the backward pass needs room for the blocks of every substep.
   void let_activations_last(backend::Stream stream) {
     if (MPM_BACKEND == MPM_BACKEND_IS_cpu || (in.lattice.deterministic() && !sums_are_fixed(facts)) || flips()) return;
+    if (!in.grows && !in.resident) return;
     if (sums_are_fixed(facts)) fix_sums(stream);
     displacements = empty_int(in.x, {2, sizeof(Displacement) / sizeof(int)});
     torch::stable::zero_(displacements);
