@@ -38,9 +38,11 @@ MPM_BACKEND_KERNELS(MPM_HEAT_CPU_KERNELS)
 #endif
 
 // On CUDA alone.
-#define MPM_HEAT_CUDA_KERNELS(PLAIN, ORDERED, SIZE) \
-  ORDERED(heat_advance, HeatAdvanceArguments)       \
-  ORDERED(heat_exchange, HeatExchangeArguments)
+#define MPM_HEAT_CUDA_KERNELS(PLAIN, ORDERED, SIZE)                   \
+  ORDERED(heat_advance, HeatAdvanceArguments)                         \
+  ORDERED(heat_exchange, HeatExchangeArguments)                       \
+  ORDERED(heat_exchange_and_surface, HeatExchangeAndSurfaceArguments) \
+  ORDERED(heat_pack, HeatPackArguments)
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda
 MPM_BACKEND_KERNELS(MPM_HEAT_CUDA_KERNELS)
 #endif

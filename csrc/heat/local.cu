@@ -1,7 +1,7 @@
 #include "heat/local.h"
 
 #include "cuda/for_each.cuh"
-#include "heat/blocks.cuh"
+#include "heat/begin_node.cuh"
 #include "heat/kernels.h"
 
 // Steps of heat at single nodes, particles and scenes, and boundaries of heat.
@@ -24,19 +24,6 @@ MPM_HD void hold(const HeatHoldArguments<T, D>& a, int64_t i) {
   if (scene < 0) return;
   const ObstaclePose<T, D> pose = pose_of(a.contact, a.obstacle, scene);
   if (pose.acts) hold_node(a, pose, scene, corner, int(i % kBlockNodes<D>), i);
-}
-
-// The part of entry i of `count`.
-template <class T>
-MPM_HD void clear(const HeatCleared<T>& cleared, int64_t i, int64_t count) {
-  for (; i < cleared.size; i += count) cleared.memory[i] = T(0);
-}
-
-template <class T, int D>
-MPM_HD void begin_node(const HeatNodesArguments<T, D>& a, int64_t i) {
-  heat_mean(a.means, i);
-  if (i < nodes_of(a.topology)) at_node<heat_boundaries<T, D>>(a.topology, a, i);
-  clear(a.means.cleared, i, a.means.nodes);
 }
 
 // Work at a scene: i < scenes.

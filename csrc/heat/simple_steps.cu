@@ -1,5 +1,6 @@
 #include "cuda/launch.cuh"
 #include "cuda/programmatic_launch.cuh"
+#include "heat/begin_node.cuh"
 #include "heat/kernels.h"
 #include "heat/operator.cuh"
 #include "transfer/tiles.cuh"
@@ -41,15 +42,15 @@ struct SimpleKernel {
   __device__ T* product() const { return a.product[a.step]; }
 };
 
+// The items of the thread block, of `blocks`.
 template <int Order, class T, int D>
-__global__ void __launch_bounds__(kPackThreads) pack_kernel(const __grid_constant__ SimpleKernel<Order, T, D> k) {
+__device__ void pack_items(const SimpleKernel<Order, T, D>& k, unsigned blocks) {
   using S = typename SimpleKernel<Order, T, D>::S;
-  grid_dependency_sync();
   __shared__ PackedOrder<S> m;
   __shared__ BaseBlock<T, D> home;
   const Topology<T, D>& t = k.topology();
   const int count = k.items();
-  for (int i = blockIdx.x; i < count; i += gridDim.x) {
+  for (int i = blockIdx.x; i < count; i += blocks) {
     const Item item = k.item(i);
     if (!k.packs(item)) continue;
     int particle[kEachPacked], cell[kEachPacked], rank[kEachPacked];
@@ -83,6 +84,17 @@ __global__ void __launch_bounds__(kPackThreads) pack_kernel(const __grid_constan
         store_packed(k.packed, m, item.begin, item.end, cell[n], rank[n], q[n], [&] { return particle[n]; });
     __syncthreads();
   }
+}
+
+// The first `blocks` thread blocks pack the particles. Those after them compute the nodes before the solve, if any.
+template <int Order, class T, int D>
+__global__ void __launch_bounds__(kPackThreads)
+    pack_kernel(const __grid_constant__ SimpleKernel<Order, T, D> k,
+                const __grid_constant__ HeatNodesArguments<T, D> nodes, unsigned blocks) {
+  grid_dependency_sync();
+  if (blockIdx.x < blocks) return pack_items(k, blocks);
+  const int64_t i = int64_t(blockIdx.x - blocks) * kPackThreads + threadIdx.x;
+  if (i < nodes.means.nodes) begin_node(nodes, i);
 }
 
 // The same with the particles of a cell in the order of the index.
@@ -421,7 +433,20 @@ void multiply(const SimpleKernel<Order, T, D>& kernel, int64_t items, Stream str
                   int(blocks));
 }
 
+template <int Order, class T, int D>
+void pack(const SimpleKernel<Order, T, D>& kernel, int64_t items, const HeatNodesArguments<T, D>& nodes,
+          Stream stream) {
+  const unsigned blocks = grid_size(items), of_nodes = unsigned((nodes.means.nodes + kPackThreads - 1) / kPackThreads);
+  launch_in_chain(pack_kernel<Order, T, D>, blocks + of_nodes, kPackThreads, 0, stream, kernel, nodes, blocks);
+}
+
 }  // namespace
+
+template <int Order, class T, int D>
+void heat_pack(const HeatPackArguments<T, D>& a, Stream stream) {
+  const Topology<T, D>& t = a.simple.solve.topology;
+  pack(SimpleKernel<Order, T, D>(a.simple), most_items(t.max_blocks, t.particles), a.nodes, stream);
+}
 
 template <int Order, class T, int D>
 void heat_simple_step(const HeatSimpleArguments<T, D>& a, Stream stream) {
@@ -435,12 +460,13 @@ void heat_simple_step(const HeatSimpleArguments<T, D>& a, Stream stream) {
     multiply<true, 1>(kernel, items, stream);
     return launch_in_chain(add_tiles_kernel<Order, T, D>, blocks_for_rows(t, 1), kTileThreads, 0, stream, kernel);
   }
-  if (!a.packed) launch_in_chain(pack_kernel<Order, T, D>, grid_size(items), kPackThreads, 0, stream, kernel);
+  if (!a.packed) pack(kernel, items, {}, stream);
   // Of few items, which leave most of a device idle, several warps process one.
   const bool few = items <= int64_t(device_attribute(cudaDevAttrMultiProcessorCount)) * 16;
   few ? multiply<false, kProductWarps>(kernel, items, stream) : multiply<false, 1>(kernel, items, stream);
 }
 
 MPM_INSTANTIATE_ORDERS(heat_simple_step, HeatSimpleArguments)
+MPM_INSTANTIATE_ORDERS(heat_pack, HeatPackArguments)
 
 }  // namespace mpm::cuda

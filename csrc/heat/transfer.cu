@@ -66,6 +66,30 @@ struct HeatExchangeSource {
   __device__ void skip(int p, int) const { store_scalar(One<T>{p}, layers.exchange, T(0)); }
 };
 
+// Two sums in one launch: even thread blocks process the items of the first, odd ones those of the second.
+template <class First, class Second>
+__global__ void __launch_bounds__(First::Shape::threads) scatter_both_kernel(const First first, const Second second) {
+  static_assert(First::Shape::threads == Second::Shape::threads);
+  grid_dependency_sync();
+  extern __shared__ __align__(16) char memory[];
+  const unsigned block = blockIdx.x / 2, blocks = gridDim.x / 2;
+  if (blockIdx.x % 2 == 0) {
+    __shared__ ScatterMemory<typename First::Shape, First::displaced> shared;
+    scatter_items(first, kNoOrder, block, blocks, memory, shared);
+  } else {
+    __shared__ ScatterMemory<typename Second::Shape, Second::displaced> shared;
+    scatter_items(second, kNoOrder, block, blocks, memory, shared);
+  }
+}
+
+template <class First, class Second>
+void launch_scatter_both(const First& first, const Second& second, Stream stream) {
+  const int64_t items = most_items(first.topology.max_blocks, first.topology.particles);
+  if (items == 0) return;
+  launch_in_chain(scatter_both_kernel<First, Second>, 2 * grid_size(items), First::Shape::threads,
+                  std::max(First::Shape::shared_bytes, Second::Shape::shared_bytes), stream, first, second);
+}
+
 template <int Order_, class T_, int D_, bool Affine>
 struct HeatGather {
   using T = T_;
@@ -171,6 +195,11 @@ void heat_exchange(const HeatExchangeArguments<T, D>& a, Stream stream) {
 }
 
 template <int Order, class T, int D>
+void heat_exchange_and_surface(const HeatExchangeAndSurfaceArguments<T, D>& a, Stream stream) {
+  launch_scatter_both(HeatExchangeSource<Order, T, D>(a.exchange), HeatSurfaceSource<Order, T, D>(a.surface), stream);
+}
+
+template <int Order, class T, int D>
 void heat_to_particles(const HeatToParticlesArguments<T, D>& a, Stream stream) {
   const auto launch = [&](const auto& task) {
     // The kernel only requires this constant, which nvcc reports as unused.
@@ -186,6 +215,7 @@ void heat_to_particles(const HeatToParticlesArguments<T, D>& a, Stream stream) {
 MPM_INSTANTIATE_ORDERS(heat_to_nodes, HeatToNodesArguments)
 MPM_INSTANTIATE_ORDERS(heat_surface, HeatSurfaceArguments)
 MPM_INSTANTIATE_ORDERS(heat_exchange, HeatExchangeArguments)
+MPM_INSTANTIATE_ORDERS(heat_exchange_and_surface, HeatExchangeAndSurfaceArguments)
 MPM_INSTANTIATE_ORDERS(heat_to_particles, HeatToParticlesArguments)
 
 }  // namespace mpm::cuda

@@ -164,6 +164,13 @@ struct HeatSurfaceArguments {
   NodeField<T> sums;  // kHeatChannels, zero on entry
 };
 
+// On CUDA: the sums of the exchange and of the free surface in one launch, where sums have no order.
+template <class T, int D>
+struct HeatExchangeAndSurfaceArguments {
+  HeatExchangeArguments<T, D> exchange;
+  HeatSurfaceArguments<T, D> surface;
+};
+
 // On the CPU: clears the sums of the slots that the substep before has used, and finds those of the next one.
 template <class T, int D>
 struct HeatSlotsArguments {
@@ -200,6 +207,14 @@ struct HeatNodesArguments {
   HeatTerm term[kMostHeatTerms]{};
   const T* number[kMostHeatTerms]{};  // of each term
   HeatTermArguments<T, D> terms;      // what all terms share
+};
+
+// On CUDA: the nodes before the solve and the packed particles of the simple steps in one launch, where sums have no
+// order.
+template <class T, int D>
+struct HeatPackArguments {
+  HeatNodesArguments<T, D> nodes;
+  HeatSimpleArguments<T, D> simple;  // its products are unused
 };
 
 // The increments of all nodes: those of simple steps, and those of the solve for the other scenes, whose solves are

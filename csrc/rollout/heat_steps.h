@@ -156,13 +156,15 @@ class HeatSteps {
   HeatSolution<T, D> conduct(const HeatToNodesArguments<T, D>& down, const Field<const T>& rest,
                              const Field<const int>& scene, backend::Stream stream) {
     const Field<const T>& x = down.x;
-    if (holds_surface()) add_layers(x, scene, stream);
-    if (has_terms()) backend::heat_surface(in_.lattice.order(), surface(x, rest), stream);
-    if (!solves_for_sums()) backend::heat_nodes(nodes(), stream);
+    sum_boundaries(x, rest, scene, stream);
+    HeatFinishArguments<T, D> finish;
+    finish.simple.solve = equations(x);
+    finish.simple.solve.workspace = workspace(stream);
+    finish.simple.packed = s_.with_heat.workspace != nullptr;
+    if (!solves_for_sums()) average(finish.simple, stream);
     for (int64_t k = 0; k < held_nodes(); k++) backend::heat_hold(hold(k, nodes_.capacity), stream);
-    HeatArguments<T, D> a = equations(x);
-    solve(a, stream);
-    return {down, a, nodes_.theta};
+    solve(finish, stream);
+    return {down, finish.simple.solve, nodes_.theta};
   }
   // The same of a step whose memory has the results.
   HeatSolution<T, D> solution(const Field<const T>& x, const Field<const T>& mass,
@@ -249,7 +251,11 @@ class HeatSteps {
   void check_terms();
   HeatNodesArguments<T, D> nodes() const;
   HeatCleared<T> next_cleared() const;
+  void sum_boundaries(const Field<const T>& x, const Field<const T>& rest, const Field<const int>& scene,
+                      backend::Stream stream);
+  HeatExchangeArguments<T, D> exchange(const Field<const T>& x, const Field<const int>& scene) const;
   void add_layers(const Field<const T>& x, const Field<const int>& scene, backend::Stream stream);
+  void average(HeatSimpleArguments<T, D>& simple, backend::Stream stream);
   void read_parameter(const Tensor& t, const char* name);
   HeatValue<T> value(size_t k) const;
   // Slots with nodes in use. On the CPU those with a block are first, where the activation counts them.
@@ -259,7 +265,7 @@ class HeatSteps {
   HeatToNodesArguments<T, D> to_nodes(const Field<const T>& x, const Field<const T>& mass,
                                       const Field<const T>& velocity_gradient) const;
   HeatArguments<T, D> equations(const Field<const T>& x) const;
-  void solve(HeatArguments<T, D>& a, backend::Stream stream);
+  void solve(HeatFinishArguments<T, D>& finish, backend::Stream stream);
 
   Substeps<T, D>& s_;
   const SubstepsInputs& in_;
@@ -372,11 +378,27 @@ HeatLayersArguments<T, D> HeatSteps<T, D>::layers(const Field<const T>& x, const
 
 // The rest of the conductance in the layer, and its exchange, which is added to the nodes.
 template <class T, int D>
-void HeatSteps<T, D>::add_layers(const Field<const T>& x, const Field<const int>& scene, backend::Stream stream) {
-  const NodeField<T> nodes{nodes_.exchange, 1, 1, s_.tile_memory()};
+void HeatSteps<T, D>::sum_boundaries(const Field<const T>& x, const Field<const T>& rest, const Field<const int>& scene,
+                                     backend::Stream stream) {
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda
-  const HeatExchangeArguments<T, D> both{layers(x, scene), s_.p2g.topology, nodes, in_.lattice.deterministic()};
-  backend::heat_exchange(in_.lattice.order(), both, stream);
+  if (holds_surface() && has_terms() && !in_.lattice.deterministic() && particles() <= kMostParticlesAtOnce)
+    return backend::heat_exchange_and_surface(
+        in_.lattice.order(), HeatExchangeAndSurfaceArguments<T, D>{exchange(x, scene), surface(x, rest)}, stream);
+#endif
+  if (holds_surface()) add_layers(x, scene, stream);
+  if (has_terms()) backend::heat_surface(in_.lattice.order(), surface(x, rest), stream);
+}
+
+template <class T, int D>
+HeatExchangeArguments<T, D> HeatSteps<T, D>::exchange(const Field<const T>& x, const Field<const int>& scene) const {
+  const NodeField<T> nodes{nodes_.exchange, 1, 1, s_.tile_memory()};
+  return {layers(x, scene), s_.p2g.topology, nodes, in_.lattice.deterministic()};
+}
+
+template <class T, int D>
+void HeatSteps<T, D>::add_layers(const Field<const T>& x, const Field<const int>& scene, backend::Stream stream) {
+#if MPM_BACKEND == MPM_BACKEND_IS_cuda
+  backend::heat_exchange(in_.lattice.order(), exchange(x, scene), stream);
 #else
   backend::heat_layers(layers(x, scene), stream);
   ScatterArguments<T, D> down;
@@ -384,9 +406,22 @@ void HeatSteps<T, D>::add_layers(const Field<const T>& x, const Field<const int>
   down.x = x;
   down.value = constant(exchange_of_particles());
   down.deterministic = in_.lattice.deterministic();
-  down.nodes = nodes;
+  down.nodes = exchange(x, scene).nodes;
   backend::scatter(in_.lattice.order(), down, stream);
 #endif
+}
+
+// The averages of the nodes and the boundaries there, and the packed particles if that saves a launch.
+template <class T, int D>
+void HeatSteps<T, D>::average(HeatSimpleArguments<T, D>& simple, backend::Stream stream) {
+#if MPM_BACKEND == MPM_BACKEND_IS_cuda
+  if (!simple.packed && !in_.lattice.deterministic()) {
+    backend::heat_pack(in_.lattice.order(), HeatPackArguments<T, D>{nodes(), simple}, stream);
+    simple.packed = true;
+    return;
+  }
+#endif
+  backend::heat_nodes(nodes(), stream);
 }
 
 // Heat from the held surface.
@@ -658,15 +693,11 @@ void* HeatSteps<T, D>::workspace(backend::Stream stream) {
 // that have left their base blocks, but for sums with an order, where none has. On CUDA the solver of the other scenes
 // does not, so an activation is requested where a scene may soon be one.
 template <class T, int D>
-void HeatSteps<T, D>::solve(HeatArguments<T, D>& a, backend::Stream stream) {
-  a.workspace = workspace(stream);
-  HeatFinishArguments<T, D> finish;
-  finish.simple.solve = a;
-  finish.simple.packed = s_.with_heat.workspace != nullptr;
+void HeatSteps<T, D>::solve(HeatFinishArguments<T, D>& finish, backend::Stream stream) {
   std::copy(std::begin(nodes_.product), std::end(nodes_.product), finish.simple.product);
   finish.theta = nodes_.theta;
   finish.sums = nodes_.sums;
-  if (for_record_) finish.increment = a.increment;
+  if (for_record_) finish.increment = finish.simple.solve.increment;
   if (solves_for_sums()) finish.cleared = next_cleared();
   finish.status = rows_of_status();
   finish.displacement = s_.counters;

@@ -75,6 +75,10 @@ constexpr int64_t kMostLateParticles = 1 << 18;
 // particles each kernel fills the device, and the second launch of P2G costs more.
 constexpr int64_t kMostParticlesAhead = 1 << 17;
 
+// Particles whose exchange with a held surface and sums for the free surface are one launch. All of its thread blocks
+// have the registers of the second, 124 in place of 79, so of more particles it takes longer than two.
+constexpr int64_t kMostParticlesAtOnce = 1 << 17;
+
 // Persistent. For a deterministic grid, or a pool of fixed size, half as many particles.
 constexpr int64_t kLeastPersistentSteps = 10, kMostPersistentParticles = 1 << 15, kMostPersistentBlocks = 256;
 // Largest number of particles of an item, with a thread each. It grows with the number of particles, so that one wave

@@ -766,29 +766,25 @@ __device__ void scatter_item(const Source& source, const Topology<typename Sourc
 // without atomics, or all with tiles.
 constexpr int kTiled = -2, kNoOrder = -1;
 
-// Source: topology, nodes, position; whether particles may be displaced; load(p, scene), or load(p, scene, place) with
-// its place in the index, the inputs of a particle; contribution(loaded), its contribution; and optionally is_due(),
-// whether there is work, and skip(p, place) for a particle outside.
+// The items of thread block `block` of `blocks`, and the particles outside. Source: topology, nodes, position; whether
+// particles may be displaced; load(p, scene), or load(p, scene, place) with its place in the index, the inputs of a
+// particle; contribution(loaded), its contribution; and optionally is_due(), whether there is work, and skip(p, place)
+// for a particle outside.
 template <class Source>
-__global__ void __launch_bounds__(Source::Shape::threads, Source::resident)
-    scatter_kernel(const Source source, int pass) {
+__device__ void scatter_items(const Source& source, int pass, unsigned block, unsigned blocks, char* memory,
+                              ScatterMemory<typename Source::Shape, Source::displaced>& shared) {
   using S = typename Source::Shape;
   using T = typename S::T;
   constexpr int D = S::D;
-  grid_dependency_sync();
-  if constexpr (requires { source.is_due(); })
-    if (!source.is_due()) return;
-  extern __shared__ __align__(16) char memory[];
-  __shared__ ScatterMemory<S, Source::displaced> shared;
   const Topology<T, D>& t = source.topology;
   const Schedule<const int> schedule = schedule_of(t);
   const bool in_order = pass != kNoOrder;
   const int4* const items = reinterpret_cast<const int4*>(schedule.items);
   const int count = *schedule.item_count;
-  int4 entries = items[blockIdx.x];  // without waiting for the count: the space suffices
-  for (int i = blockIdx.x; i < count;) {
+  int4 entries = items[block];  // without waiting for the count: the space suffices
+  for (int i = block; i < count;) {
     Item item{entries.x, entries.y, entries.z, entries.w};
-    i += gridDim.x;
+    i += blocks;
     if (i < count) entries = items[i];
     if (in_order) {
       if (pass != kTiled && block_colour(t.geometry, item.block) != pass) continue;
@@ -799,11 +795,21 @@ __global__ void __launch_bounds__(Source::Shape::threads, Source::resident)
     scatter_item(source, t, item, in_order, memory, shared, tile);
   }
   if constexpr (requires { source.skip(0, 0); }) {
-    const int64_t stride = int64_t(gridDim.x) * S::threads;
-    for (int64_t i = t.offsets[t.max_blocks] + int64_t(blockIdx.x) * S::threads + threadIdx.x; i < t.particles;
-         i += stride)
+    const int64_t stride = int64_t(blocks) * S::threads;
+    for (int64_t i = t.offsets[t.max_blocks] + int64_t(block) * S::threads + threadIdx.x; i < t.particles; i += stride)
       source.skip(t.index[i], int(i));
   }
+}
+
+template <class Source>
+__global__ void __launch_bounds__(Source::Shape::threads, Source::resident)
+    scatter_kernel(const Source source, int pass) {
+  grid_dependency_sync();
+  if constexpr (requires { source.is_due(); })
+    if (!source.is_due()) return;
+  extern __shared__ __align__(16) char memory[];
+  __shared__ ScatterMemory<typename Source::Shape, Source::displaced> shared;
+  scatter_items(source, pass, blockIdx.x, gridDim.x, memory, shared);
 }
 
 // Stores the sums of the tiles at the nodes: a thread for four words of a row of nodes along the last axis.
