@@ -138,6 +138,16 @@ def test_steps_that_begin_during_the_solve(law, scenes, with_boundaries, cells, 
     compare(step, state.replace(x=x, v=0.1 * state.v + moving), n, dt, tolerance=1e-3)
 
 
+@pytest.mark.slow
+def test_boundaries_of_many_particles(device):
+    """On CUDA the sums for a held surface and for the free surface of so many are two launches, not one."""
+    step, state = scene(3, torch.float32, per_cell=13**3, device=device)
+    assert len(state) > 2**17
+    step = held(step, (heat_boundaries.FixedSurface, bodies(3)["sphere"], 40.0))
+    step.heat.boundaries = [*step.heat.boundaries.entries, *terms()["convection"]]
+    compare(step, state, 4, tolerance=1e-3)
+
+
 def leaving(step, state, few):
     """A state that moves along the first axis, with its first particles just before the nodes of the next block."""
     x, v = state.x.clone(), torch.zeros_like(state.v)
