@@ -208,7 +208,8 @@ def until_a_time(s: Setup, device: str, samples: int) -> dict[str, Any]:
 
 def with_fixed_dt(step: mpm.Step, state: mpm.State, n: int, dt: float, device: str, samples: int) -> dict[str, Any]:
     """Seconds of a substep of fixed dt in one call by the fastest schedule, in one call by the schedule of a segment of
-    `torch_mpm.rollout_to`, and in calls of that schedule as long as a segment; and both schedules."""
+    `torch_mpm.rollout_to`, and in calls of that schedule as long as a segment; and both schedules. A shorter last call
+    has the fastest schedule: the other may not support it."""
     fastest = mpm.plan_rollout(step, state, n, dt).schedule
     own = mpm.plan_rollout(step, state, SEGMENT, torch.full((step.grid.scenes,), dt).to(state.x)).schedule
 
@@ -216,7 +217,8 @@ def with_fixed_dt(step: mpm.Step, state: mpm.State, n: int, dt: float, device: s
         def rolled() -> mpm.State:
             now = state
             for first in range(0, n, most):
-                now = mpm.rollout(step, now, min(most, n - first), dt, schedule=schedule)
+                count = min(most, n - first)
+                now = mpm.rollout(step, now, count, dt, schedule=schedule if count == most else None)
             return now
 
         return rollouts.least(device, rolled, samples) / n
