@@ -17,6 +17,7 @@ from ..step.step import Step
 from .budget import EVERYTHING, steps_of_a_call, with_parts, within_budget
 from .checkpoints import Checkpoints, as_checkpoints
 from .facts import Facts, facts_of
+from .heat_at_rest import is_heat, state_at_rest, step_at_rest
 from .reasons import why_not_fused, why_not_graphs, why_not_replay
 from .steps import Steps
 
@@ -175,6 +176,8 @@ def plan_of_steps(steps: Steps, state: State) -> RolloutPlan:
     if steps.schedule is not None:
         check_choice("schedule", steps.schedule, SCHEDULES)
     against_fused = why_not_fused(steps.step, state, steps.n, steps.dt)
+    if against_fused is None and is_heat(steps.step):
+        steps, state = steps._replace(step=step_at_rest(steps.step)), state_at_rest(state)
     checkpoints = None if steps.checkpoints is None else _checkpoints_that_fit(steps, state, against_fused is None)
     if against_fused is None:
         return _fused(steps, state, checkpoints)

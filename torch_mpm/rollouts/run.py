@@ -19,6 +19,7 @@ from .fused_op import in_calls
 from .gradient_norms import GradientNorms
 from .graph_replay import replayed
 from .graph_segments import graphed_steps
+from .heat_at_rest import heated, is_heat, state_at_rest, step_at_rest
 from .hooks import Hook, Parts
 from .plan import RolloutPlan, check_plan, plan_of_steps
 from .reasons import why_not_fused
@@ -44,7 +45,7 @@ def rollout(
     """The state n steps later.
 
     Args:
-        step: a `Step`, or any function (state, dt) -> state.
+        step: a `Step`, a `Heat`, or any function (state, dt) -> state.
         state: the initial state.
         n: number of steps.
         dt: time step [s], as `Step` takes it.
@@ -71,7 +72,8 @@ def rollout(
 
     A `Step` of compiled laws without user functions computes all steps in one op, or in a few calls of it. With heat it
     does so if the boundaries of the heat are held obstacles of the step, sources, or terms of the free surface with
-    constant numbers; laws may expand or melt, or have a `Table` of the temperature among their parameters.
+    constant numbers; laws may expand or melt, or have a `Table` of the temperature among their parameters. A `Heat`
+    alone has the same op, as heat of a body at rest, if its obstacles do not move.
     `Step.explain` returns the executor, the schedule and the reasons. The results are those of single steps. On CUDA
     they are bitwise equal, with two exceptions, which round differently, as all steps on a CPU do:
 
@@ -122,7 +124,8 @@ def _in_parts(steps: Steps, state: State, parts: Parts, plan: RolloutPlan | None
         scales = grid.scenes, grid.dx, steps.dt
     if torch.is_grad_enabled():  # The parts share the budget of memory: all of their first states are stored.
         lengths = parts.lengths_with_gradient()
-        fused = steps.checkpoints is not None and why_not_fused(step, state, steps.n, steps.dt) is None
+        fused = steps.checkpoints is not None and isinstance(step, Step)
+        fused = fused and why_not_fused(step, state, steps.n, steps.dt) is None
         with_gradient = steps.part(sum(lengths))
         steps = steps._replace(checkpoints=within_budget(with_gradient, state, fused, lengths))
 
@@ -152,6 +155,8 @@ def computed(steps: Steps, state: State, given: RolloutPlan | None = None) -> St
     if given is not None and given.executor != plan.executor:
         reason = plan.reasons.get(given.executor, "another executor computes them")
         raise ValueError(f"plan must be one for these steps, got the executor {given.executor!r}: {reason}")
+    if plan.executor == "fused" and is_heat(step):
+        return heated(state, in_calls(steps._replace(step=step_at_rest(step)), state_at_rest(state), plan))
     if plan.executor == "fused":
         return in_calls(steps, state, plan)
     if plan.executor == "replay":
