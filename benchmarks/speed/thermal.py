@@ -15,6 +15,7 @@ each kernel of a substep with heat stands beside the limits of the memory and of
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -80,6 +81,12 @@ def heated(
     return Setup(step.prepare(s.state.replace(temperature=theta, extra=extra, F=None, J=None)), step)
 
 
+def alone(s: Setup) -> Setup:
+    """The heat of a cube at rest, without its motion."""
+    cube = heated(s)
+    return dataclasses.replace(cube, step=cube.step.heat)
+
+
 def softening() -> mpm.Material:
     return mpm.ThermalExpansion(mpm.NeoHookean(E=mpm.Table(*SOFTENING), nu=NU), EXPANSION)
 
@@ -102,6 +109,7 @@ def sand(s: Setup, **options: Any) -> Setup:
 ROWS: dict[str, tuple[str | None, Callable[[Setup], Setup]]] = {
     "neo-Hookean": (None, lambda s: s),
     "heat": ("neo-Hookean", heated),
+    "heat alone, of a body at rest": ("heat", alone),
     "heat, E(T) and expansion": ("heat", lambda s: heated(s, softening())),
     "heat, melting": ("heat", lambda s: heated(s, melting(), melts=True)),
     "heat, melting, E(T) and expansion": ("heat", lambda s: heated(s, wax(), melts=True)),
