@@ -445,6 +445,7 @@ Substeps<T, D>::Substeps(const SubstepsInputs& inputs) : in(inputs) {
 template <class T, int D>
 void Substeps<T, D>::set_laws() {
   const Tensor& x = in.x;
+  if (in.laws.empty()) return;  // a body at rest
   calls = law_calls(in.laws, in.options, in.parameters, in.history, in.variables, D);
   fused_kernels = fused_kernels_of<T, D>(calls[0].law->info.name);
   check_material(in.material, calls, x);
@@ -556,9 +557,10 @@ PlanFacts Substeps<T, D>::facts_of_call() const {
   f.sorted = has(in.ids);
   f.laws = int64_t(calls.size());
   f.materials = has(in.material);
-  f.additive = calls[0].law->info.additive;
+  f.additive = !calls.empty() && calls[0].law->info.additive;
   f.uniform_parameters = true;
-  for (size_t k = 0; k < calls[0].parameters.size(); k++) f.uniform_parameters &= laws[0].law.parameters[k].stride == 0;
+  for (size_t k = 0; !calls.empty() && k < calls[0].parameters.size(); k++)
+    f.uniform_parameters &= laws[0].law.parameters[k].stride == 0;
   f.one_deformation = has(in.F) != has(in.J);
   f.gradients = !in.resident;
   f.records = in.records;

@@ -3,6 +3,7 @@
 #include "common/signals.h"
 #include "common/team.h"
 #include "rollout/recorded.h"
+#include "rollout/schedules/heat_at_rest.op.h"
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
 #include "rollout/schedules/sorted_cpu.op.h"
 #else
@@ -136,6 +137,12 @@ Results run(const SubstepsInputs& in) {
   check_positions(x);
   const DeviceScope device(x);
   std::optional<Results> results;
+  if (in.laws.empty()) {
+    STD_TORCH_CHECK(!in.heat.empty(), "laws must not be empty without heat");
+    schedule_of_latest = kPerStep;
+    dispatch(x, [&]<class T, int D>() { results = HeatAtRest<T, D>(in, device.stream()).run(); });
+    return *std::move(results);
+  }
   if (in.records && !has(in.impulse) && x.size(0) > 0)
     dispatch(x, [&]<class T, int D>() { results = run_recorded<T, D>(in, device.stream()); });
   if (!results) dispatch(x, [&]<class T, int D>() { results = run_steps<T, D>(in, device.stream()); });

@@ -7,6 +7,7 @@ from pairs import in_pairs
 
 import torch_mpm as mpm
 from torch_mpm import heat_boundaries
+from torch_mpm.grid.topology import Status
 from torch_mpm.rollouts import plan_rollout
 
 F64 = torch.float64
@@ -74,6 +75,33 @@ def test_boundaries(kind, dtype, dim, device):
     heat.to(device)
     heat.tolerance = 1e-12 if dtype == F64 else 1e-6
     compare(heat, state, dt=DT / 10, tolerance=1e-9 if dtype == F64 else 1e-4)
+
+
+def test_obstacles_that_act_for_a_time(dim, device):
+    heat, state = alone(dim, device=device)
+    ball = mpm.Sphere((0.45, 0.25, 0.45)[:dim], 0.12, start=1.5 * DT, end=4.5 * DT)
+    heat.boundaries = [heat_boundaries.FixedSurface(ball, 40.0)]
+    heat.tolerance = 1e-12
+    end = compare(heat, state, 8, tolerance=1e-9)
+    assert not torch.allclose(end.temperature, state.temperature)
+
+
+def test_a_full_pool(device):
+    heat, state = alone(2, device=device, max_blocks=1, transfer="flip")
+    before = state.temperature.clone()
+    with pytest.raises(mpm.GridOverflowError):
+        mpm.rollout(heat, state, 9, DT)
+        heat.check()
+    assert torch.equal(before, state.temperature)
+
+
+@pytest.mark.parametrize("n", [1, 7, 8, 40])
+def test_calls_of_any_length(n, device):
+    """On a CPU particles are sorted from 8 steps on."""
+    heat, state = alone(2, melts=True, device=device)
+    heat.tolerance = 1e-12
+    compare(heat, state, n)
+    assert int(heat.status[0, Status.ACTIVATIONS]) == 2 * n  # Those of the op and the single steps.
 
 
 def test_time_steps_of_scenes(device):

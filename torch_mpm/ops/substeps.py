@@ -28,7 +28,8 @@ compensated.
 
 Heat is conducted where `heat` is not empty: temperature [P], conductivity and specific heat; for materials that melt
 also liquid fraction [P], melting point and latent heat; and last, for the first two numbers in `TRANSFERS` of
-torch_mpm.heat, the temperature gradient [P, D]. Parameters are [], [1], [B] or [P].
+torch_mpm.heat, the temperature gradient [P, D]. Parameters are [], [1], [B] or [P]. Where `laws` is empty the body is
+at rest: a call without gradients only changes its heat.
 `heat_options` are the number of the transfer, the maximum number of iterations, and whether the last of the
 `held_obstacles` holds its surface (1) instead of the nodes in it; `heat_scalars` are tolerance, reference [K],
 the share of the dissipated energy that becomes heat, and the tolerance of the adjoint solves.

@@ -10,7 +10,7 @@ from torch import Tensor
 from ..boundaries.damping import split_damping
 from ..errors import check_count, check_flag, shape_of
 from ..grid.topology import Status
-from ..laws.calls import law_calls
+from ..laws.calls import LawCalls, law_calls
 from ..ops.autograd import dispatch
 from ..ops.contact import obstacle_arguments
 from ..ops.grid_update import per_scene, wall_arguments
@@ -62,7 +62,7 @@ def _in_order(steps: Steps, state: State, plan: RolloutPlan) -> State:
     step, n = steps.step, steps.n
     assert plan.facts is not None and isinstance(step, Step)
     end = given = step.prepare(state)
-    most = n if plan.facts.gradients else STEPS_IN_ORDER if step.heat is None else STEPS_WITH_HEAT
+    most = n if plan.facts.gradients or step._rests else STEPS_IN_ORDER if step.heat is None else STEPS_WITH_HEAT
     plan = plan.of_sorted()
     for first in range(0, n, most):
         start = sort_particles(step, end)
@@ -142,12 +142,13 @@ def _arguments(
     times = StepTimes.of(state, n, dt, grid.scenes) if boundaries and follows_paths(step) else None
     pool = grid.pool(state.x, state.scene)
     law.check_parameters(len(state), grid.scenes)
-    calls = law_calls(law, state, dt, step.heat is not None)
     apic = step.transfer == "apic"
     wants_C = step._keeps_C or step.heat is not None
     table, *others = obstacle_arguments(boundaries, state.x, grid.scenes, times)
     of_table = table is not None and table.requires_grad
     with_gradient = torch.is_grad_enabled() and (of_table or differentiates(step, state, dt))
+    rests = step._rests and not (with_gradient or state.x.is_cuda or step.boundaries.reads_time)
+    calls = NO_CALLS if rests else law_calls(law, state, dt, step.heat is not None)
     arguments = (
         *(state.x, state.v, state.mass, state.volume, state.C, state.F, state.J),
         None if state.x_residual is None else state.x_residual.detach(),
@@ -166,6 +167,10 @@ def _arguments(
     return arguments, calls.history_names
 
 
+NO_CALLS = LawCalls([], [], [], [], [], [], None, [], [])
+"""No law, for a body at rest."""
+
+
 def _substeps(
     step: Step,
     state: State,
@@ -180,6 +185,7 @@ def _substeps(
     grid, errors = step.grid, step._error_status
     errors.begin(state, grid.scenes)
     arguments, history_names = _arguments(step, state, n, dt, records, blocks, schedule)
+    rests = arguments[ARGUMENTS.index("laws")] == ""
     op = torch.ops.torch_mpm.substeps
     if bodies is not None:
         op = torch.ops.torch_mpm.substeps_with_bodies
@@ -189,6 +195,8 @@ def _substeps(
     x, v, C, F, J, history, status, impulse, time, residual, heat, heat_status, _, *of_bodies = results
     if bodies is not None:
         bodies.follow(*of_bodies)
+    if rests:  # One activation, while the status counts the steps.
+        status[0, Status.ACTIVATIONS] += n - 1
     errors.follow(errors.status, status)
     grid.watch(status)
     if status.is_cpu:  # The op has enlarged the pool, or stopped.

@@ -1,4 +1,5 @@
-"""`Heat` alone in the fused op: steps of a fluid at rest, which has no stress and therefore stays there."""
+"""`Heat` alone in the fused op: steps of a fluid at rest, which has no stress and therefore stays there. A call on the
+CPU without gradients only conducts its heat."""
 
 from __future__ import annotations
 
@@ -40,7 +41,7 @@ def _held(heat: Heat) -> list[Obstacle]:
 def step_at_rest(heat: Heat) -> Step:
     """A step with this heat, of a fluid whose pressure is zero at its rest volume. Both have one status."""
     step = Step(heat.grid, WeaklyCompressible(1.0), boundaries=_held(heat), heat=heat)
-    step._error_status = heat._error_status
+    step._error_status, step._rests = heat._error_status, True
     return step
 
 

@@ -207,6 +207,9 @@ def _checkpoints_that_fit(steps: Steps, state: State, fused: bool) -> Checkpoint
     return within_budget(steps, state, fused)
 
 
+LEAST_STEPS_IN_ORDER = 8
+"""Number of steps of a body at rest for which it pays to sort its particles on the CPU. Those of a body in motion are
+reordered by the op."""
 _INSTEAD = {name: "the op computes all steps" for name in ("replay", "graph", "loop")}
 
 
@@ -214,10 +217,12 @@ def _fused(steps: Steps, state: State, checkpoints: Checkpoints | None) -> Rollo
     """The plan for the fused op."""
     facts = facts_of(steps, state, checkpoints is EVERYTHING)
     plan = _planned(steps.schedule, facts)
-    if checkpoints is None and not facts.gradients:
-        return plan
     step, steps_per_call = steps.step, plan.steps_per_call
     assert isinstance(step, Step)
+    if step._rests and not (facts.cuda or facts.gradients or facts.sorted) and steps.n >= LEAST_STEPS_IN_ORDER:
+        plan = dataclasses.replace(plan, sorts=True)
+    if checkpoints is None and not facts.gradients:
+        return plan
     if facts.gradients and checkpoints is not EVERYTHING:
         checkpoints = None if checkpoints is None else with_parts(checkpoints, step, state, steps.n)
         every = None if checkpoints is None else checkpoints.every

@@ -144,6 +144,7 @@ class Step(TensorModule):
         self.integrator = integrator  # type: ignore[assignment]
         self.compensated = compensated
         self._error_status = ErrorStatus()
+        self._rests = False  # Whether the body stays at rest, see rollouts/heat_at_rest.py.
         self._kept_gravity = DeviceConstantCache()
         locking.warn(self.law, self.grid.kernel, devices=False)
 
