@@ -201,7 +201,10 @@ def test_records_have_checksums(tmp_path, record):
     digits = [k for k, letter in enumerate(text) if letter.isdigit()]
     for k in digits[:: max(1, len(digits) // 40)]:
         other = "1" if text[k] != "1" else "2"
-        (path / record).write_text(text[:k] + other + text[k + 1 :])
+        changed = text[:k] + other + text[k + 1 :]
+        if json.loads(changed) == json.loads(text):
+            continue  # The last of 17 digits may not change the number.
+        (path / record).write_text(changed)
         with pytest.raises(DamagedFileError):
             DatasetFolder(path).scenes()
 
