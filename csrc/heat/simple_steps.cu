@@ -97,7 +97,7 @@ __global__ void __launch_bounds__(kPackThreads)
   if (i < nodes.means.nodes) begin_node(nodes, i);
 }
 
-// The same with the particles of a cell in the order of the index.
+// Packs the particles of a cell in the order of the index.
 template <int Order, class T, int D>
 __global__ void __launch_bounds__(kProductThreads)
     pack_in_order_kernel(const __grid_constant__ SimpleKernel<Order, T, D> k) {

@@ -376,7 +376,7 @@ HeatLayersArguments<T, D> HeatSteps<T, D>::layers(const Field<const T>& x, const
   return a;
 }
 
-// The rest of the conductance in the layer, and its exchange, which is added to the nodes.
+// Sums of the nodes for the exchange with a held surface, and for the free surface.
 template <class T, int D>
 void HeatSteps<T, D>::sum_boundaries(const Field<const T>& x, const Field<const T>& rest, const Field<const int>& scene,
                                      backend::Stream stream) {
@@ -395,25 +395,27 @@ HeatExchangeArguments<T, D> HeatSteps<T, D>::exchange(const Field<const T>& x, c
   return {layers(x, scene), s_.p2g.topology, nodes, in_.lattice.deterministic()};
 }
 
+// The rest of the conductance in the layer, and its exchange, which is added to the nodes.
 template <class T, int D>
 void HeatSteps<T, D>::add_layers(const Field<const T>& x, const Field<const int>& scene, backend::Stream stream) {
+  const HeatExchangeArguments<T, D> a = exchange(x, scene);
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda
-  backend::heat_exchange(in_.lattice.order(), exchange(x, scene), stream);
+  backend::heat_exchange(in_.lattice.order(), a, stream);
 #else
-  backend::heat_layers(layers(x, scene), stream);
+  backend::heat_layers(a.layers, stream);
   ScatterArguments<T, D> down;
-  down.topology = s_.p2g.topology;
+  down.topology = a.topology;
   down.x = x;
   down.value = constant(exchange_of_particles());
-  down.deterministic = in_.lattice.deterministic();
-  down.nodes = exchange(x, scene).nodes;
+  down.deterministic = a.deterministic;
+  down.nodes = a.nodes;
   backend::scatter(in_.lattice.order(), down, stream);
 #endif
 }
 
 // The averages of the nodes and the boundaries there, and the packed particles if that saves a launch.
 template <class T, int D>
-void HeatSteps<T, D>::average(HeatSimpleArguments<T, D>& simple, backend::Stream stream) {
+void HeatSteps<T, D>::average([[maybe_unused]] HeatSimpleArguments<T, D>& simple, backend::Stream stream) {
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda
   if (!simple.packed && !in_.lattice.deterministic()) {
     backend::heat_pack(in_.lattice.order(), HeatPackArguments<T, D>{nodes(), simple}, stream);

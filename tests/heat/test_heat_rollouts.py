@@ -140,7 +140,7 @@ def test_steps_that_begin_during_the_solve(law, scenes, with_boundaries, cells, 
 
 @pytest.mark.slow
 def test_boundaries_of_many_particles(device):
-    """On CUDA the sums for a held surface and for the free surface of so many are two launches, not one."""
+    """The held surface and the free surface have a launch each on CUDA, for more than 2^17 particles."""
     step, state = scene(3, torch.float32, per_cell=13**3, device=device)
     assert len(state) > 2**17
     step = held(step, (heat_boundaries.FixedSurface, bodies(3)["sphere"], 40.0))

@@ -15,11 +15,9 @@ from ..step.status import aside
 from ..step.step import Step
 from .budget import EVERYTHING, needs_of
 from .checkpoints import Checkpoints, as_checkpoints
-from .heat_at_rest import is_heat, state_at_rest, step_at_rest
 from .hooks import Parts
 from .memory import differentiable, seconds
-from .plan import RolloutPlan, plan_of_steps
-from .reasons import why_not_fused
+from .plan import RolloutPlan, in_steps, plan_of_steps
 from .run import rollout
 from .steps import Steps
 
@@ -87,8 +85,7 @@ def estimate_rollout(
     check_count("n", n)
     parts, checkpoints = Parts(n, prefix, truncate), as_checkpoints(checkpoint)
     first = parts.first_with_gradient()
-    if is_heat(step) and why_not_fused(step, state, n, dt) is None:
-        step, state = step_at_rest(step), state_at_rest(state)
+    (step, *_), state = in_steps(Steps(step, n, dt), state)
     start = differentiable(step.prepare(state) if isinstance(step, Step) else state)
     with aside(step, start.x), torch.enable_grad():
         plan = plan_of_steps(Steps(step, n - first, dt, checkpoints), start)

@@ -171,13 +171,20 @@ def plan_rollout(
     return plan_of_steps(Steps(step, n, dt, checkpoints, graph, schedule), state)
 
 
+def in_steps(steps: Steps, state: State) -> tuple[Steps, State]:
+    """A `Heat` alone as a `Step` of a body at rest, with its state, if the fused op supports it; others as they are."""
+    step = steps.step
+    if not is_heat(step) or why_not_fused(step, state, steps.n, steps.dt) is not None:
+        return steps, state
+    return steps._replace(step=step_at_rest(step)), state_at_rest(state)
+
+
 def plan_of_steps(steps: Steps, state: State) -> RolloutPlan:
     """`plan_rollout` for arguments that were checked."""
     if steps.schedule is not None:
         check_choice("schedule", steps.schedule, SCHEDULES)
+    steps, state = in_steps(steps, state)
     against_fused = why_not_fused(steps.step, state, steps.n, steps.dt)
-    if against_fused is None and is_heat(steps.step):
-        steps, state = steps._replace(step=step_at_rest(steps.step)), state_at_rest(state)
     checkpoints = None if steps.checkpoints is None else _checkpoints_that_fit(steps, state, against_fused is None)
     if against_fused is None:
         return _fused(steps, state, checkpoints)

@@ -36,14 +36,14 @@ from .anomaly import detecting
 from .facts import has_mirrors
 from .fused_heat import why_not_fused_heat
 from .graph_replay import LEAST_STEPS
-from .heat_at_rest import is_heat, state_at_rest, step_at_rest, why_not_at_rest
+from .heat_at_rest import is_heat, step_at_rest, why_not_at_rest
 from .steps import Steps
 
 
 def why_not_fused(step: Any, state: State, n: int, dt: float | Tensor) -> str | None:
     """Reason why the fused op does not support n steps; None if it does."""
     if is_heat(step):
-        return why_not_at_rest(step) or why_not_fused(step_at_rest(step), state_at_rest(state), n, dt)
+        return why_not_at_rest(step) or why_not_fused(step_at_rest(step), state, n, dt)
     if type(step) is not Step:
         return f"{type(step).__name__} may do more than a Step" if isinstance(step, Step) else "it is no Step"
     x, law, boundaries = state.x, step.law, step.boundaries

@@ -19,9 +19,9 @@ from .fused_op import in_calls
 from .gradient_norms import GradientNorms
 from .graph_replay import replayed
 from .graph_segments import graphed_steps
-from .heat_at_rest import heated, is_heat, state_at_rest, step_at_rest
+from .heat_at_rest import heated, is_heat
 from .hooks import Hook, Parts
-from .plan import RolloutPlan, check_plan, plan_of_steps
+from .plan import RolloutPlan, check_plan, in_steps, plan_of_steps
 from .reasons import why_not_fused
 from .steps import Steps
 
@@ -148,17 +148,17 @@ def computed(steps: Steps, state: State, given: RolloutPlan | None = None) -> St
     Raises:
         ValueError: for a given plan with another executor than the plan of these steps.
     """
-    step = steps.step
+    step, before = steps.step, state
     if isinstance(step, Step):
         state = step.with_residual(state, steps.dt)
+    steps, state = in_steps(steps, state)
     plan = plan_of_steps(steps, state)
     if given is not None and given.executor != plan.executor:
         reason = plan.reasons.get(given.executor, "another executor computes them")
         raise ValueError(f"plan must be one for these steps, got the executor {given.executor!r}: {reason}")
-    if plan.executor == "fused" and is_heat(step):
-        return heated(state, in_calls(steps._replace(step=step_at_rest(step)), state_at_rest(state), plan))
     if plan.executor == "fused":
-        return in_calls(steps, state, plan)
+        end = in_calls(steps, state, plan)
+        return heated(before, end) if is_heat(step) else end
     if plan.executor == "replay":
         return replayed(steps, state)
     return _from_python(steps, state, plan)

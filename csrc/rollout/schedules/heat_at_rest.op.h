@@ -18,6 +18,7 @@ class HeatAtRest {
         stream_(stream),
         s_(in_),
         heat_(s_),
+        particles_(given_particles<T, D>(in_, absent())),
         status_(empty_int(in_.x, {1 + in_.scenes, kStatusSize})),
         velocity_gradient_(empty_particles(in_.x, {P(), D, D})) {
     STD_TORCH_CHECK(in_.resident && !in_.records,
@@ -35,7 +36,7 @@ class HeatAtRest {
   Results run() {
     s_.make_pool(stream_);
     s_.count_time(s_.previous_status, stream_);
-    s_.activation.x = field<const T>(in_.x);
+    s_.activation.x = particles_.x;
     int* const status = static_cast<int*>(status_.data_ptr());
     if (s_.activate(s_.previous_status, status, stream_)) with_team(P() * in_.n, [&] { run_steps(); });
     return {copy_of(in_.x), copy_of(in_.v), copy(in_.C),        copy(in_.F),   copy(in_.J),  absent(), status_,
@@ -47,6 +48,7 @@ class HeatAtRest {
   const backend::Stream stream_;
   Substeps<T, D> s_;
   HeatSteps<T, D> heat_;
+  const Particles<const T> particles_;
   Tensor status_, velocity_gradient_;
   Tensor time_ = absent();
 
@@ -54,14 +56,13 @@ class HeatAtRest {
   static Tensor copy(const OptionalTensor& t) { return has(t) ? copy_of(*t) : absent(); }
 
   void step(backend::Stream on) {
-    const Field<const T> F = optional(in_.F), J = optional(in_.J);
-    if (heat_.begins()) heat_.begin(F, J, s_.p2g.volume, on);
-    if (MPM_BACKEND != MPM_BACKEND_IS_cpu) heat_.store_volumes(F, J, s_.p2g.volume);
+    const Field<const T>& rest = s_.p2g.volume;
+    if (heat_.begins()) heat_.begin(particles_.F, particles_.J, rest, on);
+    if (MPM_BACKEND != MPM_BACKEND_IS_cpu) heat_.store_volumes(particles_.F, particles_.J, rest);
     const Field<const int> scene{s_.activation.scene, {s_.activation.scene_stride}};
-    heat_.run(field<const T>(in_.x), s_.p2g.mass, s_.p2g.volume, field<const T>(velocity_gradient_), scene, on);
+    heat_.run(particles_.x, s_.p2g.mass, rest, field<const T>(velocity_gradient_), scene, on);
     s_.end_time(on);
   }
-  static Field<const T> optional(const OptionalTensor& t) { return has(t) ? field<const T>(*t) : Field<const T>{}; }
 
   // On CUDA graphs repeat pairs of steps.
   void run_steps() {
