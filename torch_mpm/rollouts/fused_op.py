@@ -147,7 +147,7 @@ def _arguments(
     table, *others = obstacle_arguments(boundaries, state.x, grid.scenes, times)
     of_table = table is not None and table.requires_grad
     with_gradient = torch.is_grad_enabled() and (of_table or differentiates(step, state, dt))
-    rests = step._rests and not (with_gradient or state.x.is_cuda or step.boundaries.reads_time)
+    rests = step._rests and not (with_gradient or step.boundaries.reads_time)
     calls = NO_CALLS if rests else law_calls(law, state, dt, step.heat is not None)
     arguments = (
         *(state.x, state.v, state.mass, state.volume, state.C, state.F, state.J),

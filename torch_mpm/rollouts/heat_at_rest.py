@@ -1,5 +1,5 @@
-"""`Heat` alone in the fused op: steps of a fluid at rest, which has no stress and therefore stays there. A call on the
-CPU without gradients only conducts its heat."""
+"""`Heat` alone in the fused op: steps of a fluid at rest, which has no stress and therefore stays there. A call without
+gradients only conducts its heat."""
 
 from __future__ import annotations
 

@@ -215,8 +215,8 @@ def _checkpoints_that_fit(steps: Steps, state: State, fused: bool) -> Checkpoint
 
 
 LEAST_STEPS_IN_ORDER = 8
-"""Number of steps of a body at rest for which it pays to sort its particles on the CPU. Those of a body in motion are
-reordered by the op."""
+"""Number of steps of a body at rest for which it pays to sort its particles. The op reorders those of a body in
+motion."""
 _INSTEAD = {name: "the op computes all steps" for name in ("replay", "graph", "loop")}
 
 
@@ -226,7 +226,7 @@ def _fused(steps: Steps, state: State, checkpoints: Checkpoints | None) -> Rollo
     plan = _planned(steps.schedule, facts)
     step, steps_per_call = steps.step, plan.steps_per_call
     assert isinstance(step, Step)
-    if step._rests and not (facts.cuda or facts.gradients or facts.sorted) and steps.n >= LEAST_STEPS_IN_ORDER:
+    if step._rests and not (facts.gradients or facts.sorted) and steps.n >= LEAST_STEPS_IN_ORDER:
         plan = dataclasses.replace(plan, sorts=True)
     if checkpoints is None and not facts.gradients:
         return plan

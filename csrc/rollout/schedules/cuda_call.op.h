@@ -1,12 +1,11 @@
 #pragma once
 
-#include "common/signals.h"
-#include "cuda/graph.h"
 #include "cuda/side_stream.h"
 #include "rollout/heat_steps.h"
 #include "rollout/schedules/block_per_scene.op.h"
 #include "rollout/schedules/fused_g2p2g.op.h"
 #include "rollout/schedules/persistent.op.h"
+#include "rollout/schedules/replay_pairs.op.h"
 #include "rollout/thermal_laws.op.h"
 
 // A call of many substeps on CUDA without a record: its results, and a function for each schedule.
@@ -237,8 +236,7 @@ class CudaCall {
       after_substeps(P(), 1, stream_);
       if (++step_ == 2) {
         const auto two = [&](backend::Stream on) { substep(0, false, on), substep(1, false, on); };
-        step_ += 2 * replay((in_.n - step_ - after) / 2, replays_of_graph(P()), stream_, two,
-                            [&](int64_t count) { after_substeps(P(), 2 * count, stream_); });
+        step_ += replay_pairs(in_.n - step_ - after, P(), stream_, two);
       }
     }
   }

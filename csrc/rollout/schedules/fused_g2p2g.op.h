@@ -1,7 +1,6 @@
 #pragma once
 
-#include "common/signals.h"
-#include "cuda/graph.h"
+#include "rollout/schedules/replay_pairs.op.h"
 #include "rollout/step_kernels.h"
 
 // A call of many substeps on CUDA that owns its particles: G2P and the next P2G are one kernel while an activation
@@ -77,8 +76,7 @@ void FusedG2P2G<T, D>::run(const Particles<const T>& given, const int* before) {
   int64_t step = 1;
   run_substep(step++, false, stream_);
   const auto two = [&](backend::Stream on) { run_substep(step, false, on), run_substep(step + 1, false, on); };
-  step += 2 * replay((last - step) / 2, replays_of_graph(rows_), stream_, two,
-                     [&](int64_t count) { after_substeps(rows_, 2 * count, stream_); });
+  step += replay_pairs(last - step, rows_, stream_, two);
   for (; step <= last; step++) {
     run_substep(step, step == last, stream_);
     after_substeps(rows_, 1, stream_);

@@ -3,7 +3,7 @@
 #include "common/signals.h"
 #include "rollout/heat_steps.h"
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda
-#include "cuda/graph.h"
+#include "rollout/schedules/replay_pairs.op.h"
 #endif
 
 // Steps of the heat of a body at rest, a call without laws: one activation serves them all, and no node moves.
@@ -73,8 +73,7 @@ class HeatAtRest {
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda
       if (done != 2) continue;
       const auto two = [&](backend::Stream on) { step(on), step(on); };
-      done += 2 * replay((in_.n - done) / 2, replays_of_graph(P()), stream_, two,
-                         [&](int64_t count) { after_substeps(P(), 2 * count, stream_); });
+      done += replay_pairs(in_.n - done, P(), stream_, two);
 #endif
     }
   }
