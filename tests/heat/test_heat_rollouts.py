@@ -25,6 +25,7 @@ from pairs import in_pairs
 import torch_mpm as mpm
 from benchmarks.catalogue.laws import named
 from torch_mpm import heat_boundaries
+from torch_mpm.heat.heat import present_volume
 from torch_mpm.laws.parameters import PerMaterial
 from torch_mpm.rollouts import plan_rollout
 
@@ -319,6 +320,29 @@ def test_heat_of_a_source_is_its_energy(device):
         end = mpm.rollout(step, state, 1, DT)
     grown = (step.heat.heat_content(end) - step.heat.heat_content(state)).sum()
     assert float(grown) == pytest.approx(2e8 * float(state.volume.sum()) * DT, rel=1e-9)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("transfer", TRANSFERS)
+def test_energy_balance_over_1000_steps(transfer, dtype, device):
+    """One call, of a body in motion that a source melts: the heat content grows by the power times the present volumes
+    and the time, which a run of single steps adds up. In float32 the fields are rounded in each step."""
+    step, state = scene(2, dtype, transfer=transfer, melts=True, device=device)
+    step.heat.boundaries = [heat_boundaries.Source(power := 3e6)]
+    state = state.replace(temperature=state.temperature - 4, extra={})
+    state, volumes = step.prepare(state), []
+
+    def measure(state, k):
+        volumes.append(float(present_volume(state).double().sum()))
+
+    with torch.no_grad():
+        mpm.rollout(step, state, 1000, DT, hook=measure, every=1)
+        assert plan_rollout(step, state, 1000, DT).executor == "fused"
+        end = mpm.rollout(step, state, 1000, DT)
+    step.check(end)
+    assert float(state.extra["liquid"].max()) == 0 and float(end.extra["liquid"].mean()) > 0.1
+    gained = float((step.heat.heat_content(end).double() - step.heat.heat_content(state).double()).sum())
+    assert gained == pytest.approx(power * sum(volumes) * DT, rel=1e-10 if dtype == torch.float64 else 1e-5)
 
 
 @pytest.mark.parametrize("deterministic", [False, True])
