@@ -61,7 +61,7 @@ KEPT = {
 
 @pytest.mark.parametrize("kept", KEPT)
 @pytest.mark.parametrize("kind", ["one op", "network", "heat"])
-def test_gradients_are_those_without(kind, kept, device, monkeypatch):
+def test_gradients_are_those_without(kind, kept, device, monkeypatch, one_thread):
     monkeypatch.setattr("torch_mpm.rollouts.budget.KEPT_BYTES", {"cpu": 0, "cuda": 0})  # of a scene that is so small
     found = []
     for checkpoint in (None, KEPT[kept]):

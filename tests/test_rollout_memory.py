@@ -84,8 +84,18 @@ def test_laws_of_temperature(name, kept):
     check(step, state, KEPT[kept])
 
 
+@pytest.mark.parametrize("threads", [1, 3])
+@pytest.mark.parametrize("law", ["viscoelastic", "wax"])
+def test_threads_copy_particles(law, threads):
+    """For their laws. Of a small scene that is most of the memory."""
+    step, state = heat_scenes.thermal([law], 2, torch.float32, per_cell=4)
+    torch.set_num_threads(threads)  # until the next test, see conftest.py
+    check(step, state, mpm.Checkpoints(every=1, states=2))
+    check(*without_heat(*heat_scenes.scene(2, torch.float32, per_cell=4)), mpm.Checkpoints(every=1, states=2))
+
+
 @pytest.mark.parametrize("of", ["tables", "particles"])
-def test_gradients_by_parameters(of):
+def test_gradients_by_parameters(of, one_thread):
     """The backward pass has an adjoint per particle of each parameter, and of each value of a table."""
     step, state = heat_scenes.scene(2, torch.float32, per_cell=4)
     if of == "tables":

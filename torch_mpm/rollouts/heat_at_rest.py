@@ -3,6 +3,7 @@ gradients only conducts its heat."""
 
 from __future__ import annotations
 
+import functools
 from typing import Any, TypeGuard
 
 import torch
@@ -38,9 +39,15 @@ def _held(heat: Heat) -> list[Obstacle]:
     return list(dict.fromkeys(region for region in regions if isinstance(region, Obstacle)))
 
 
+@functools.cache
+def _fluid() -> WeaklyCompressible:
+    """Made once, since that takes longer than a step of few particles."""
+    return WeaklyCompressible(1.0)
+
+
 def step_at_rest(heat: Heat) -> Step:
     """A step with this heat, of a fluid whose pressure is zero at its rest volume. Both have one status."""
-    step = Step(heat.grid, WeaklyCompressible(1.0), boundaries=_held(heat), heat=heat)
+    step = Step(heat.grid, _fluid(), boundaries=_held(heat), heat=heat)
     step._error_status, step._rests = heat._error_status, True
     return step
 

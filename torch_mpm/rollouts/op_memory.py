@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 
+import torch
 from torch import Tensor
 
 from ..boundaries import Obstacle
@@ -16,7 +17,7 @@ from ..boundaries.damping import split_damping
 from ..heat.boundaries import Fixed, FixedSurface, Term
 from ..heat.heat import GRADIENT
 from ..laws import CompiledLaw, Mixture
-from ..laws.calls import law_calls, laws_of, passive
+from ..laws.calls import LawCalls, law_calls, laws_of, passive
 from ..laws.parameters import PerMaterial
 from ..laws.thermal import LIQUID
 from ..laws.thermal_calls import laws_in
@@ -36,6 +37,8 @@ _CLEARED = 1 << 26
 """Bytes of nodes that the backward pass clears at once, `kCleared` in csrc/rollout/heat_backward.h."""
 _SIMPLE_STEPS = 3
 """`kMostSimpleSteps` in csrc/heat/solve.h."""
+_COPY_LINE = 1024 + 16
+"""`kCopyLine` in csrc/rollout/laws_p2g.h."""
 
 
 def needs_of_op(step: Step, state: State, dt: float | Tensor) -> Needs:
@@ -251,7 +254,16 @@ class _Sizes:
         if self._heat is not None:
             nodes += self._nodes(slots) * self._heat_nodes() * self._size
             nodes += slots * self._tiles(resident=True) * self._size
-        return self._rows(2 * columns + self._matrix + thermal) + self._activation() + nodes
+        of_particles = self._rows(2 * columns + self._matrix + thermal) + self._copies(calls)
+        return of_particles + self._activation() + nodes
+
+    def _copies(self, calls: LawCalls) -> int:
+        """Particles that threads of a CPU copy for their laws, `ChunkRows` in csrc/rollout/laws_p2g.h [bytes]."""
+        if self._cuda:
+            return 0
+        rows = 1 + 3 * self._matrix + self._extra() + len(calls.parameters)
+        rows += 4 + 2 * self._matrix + len(calls.parameters) if calls.thermal else 0
+        return torch.get_num_threads() * rows * _COPY_LINE * self._size
 
     def _activation(self) -> int:
         """Working memory of an activation, and numbers of the particles [bytes]."""
