@@ -566,6 +566,7 @@ PlanFacts Substeps<T, D>::facts_of_call() const {
   f.records = in.records;
   f.obstacles = contact.obstacles;
   f.heat = !in.heat.empty();
+  f.rests = in.laws.empty();
   f.bodies = in.bodies != nullptr;
   return f;
 }

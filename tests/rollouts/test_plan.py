@@ -43,6 +43,7 @@ CUDA = Facts(
     path_bytes=0,
     obstacles=0,
     heat=False,
+    rests=False,
     bodies=False,
 )
 CPU = CUDA._replace(cuda=False, graph_loops=False)
@@ -167,6 +168,14 @@ def test_decisions(facts, changes, schedule, blocks, steps):
         ({"particles": 2**18, "heat": True, "steps": 127, "sorted": True}, 0),
         ({"particles": 2**18 - 1, "heat": True, "steps": 128, "sorted": True}, 0),
         ({"particles": 2**18, "heat": True, "steps": 128, "sorted": True, "gradients": True}, 0),
+        ({"particles": 2**18, "heat": True, "rests": True, "steps": 8}, 1),
+        ({"particles": 2**18, "heat": True, "rests": True, "steps": 7}, 0),
+        ({"particles": 2**18 - 1, "heat": True, "rests": True, "steps": 8}, 0),
+        ({"particles": 2**18, "heat": True, "rests": True, "steps": 8, "sorted": True}, 0),
+        ({"particles": 2**18, "heat": True, "rests": True, "steps": 8, "gradients": True}, 0),
+        ({"particles": 2**18, "heat": True, "rests": True, "steps": 8, "captured": True}, 0),
+        ({"cuda": False, "particles": 10, "heat": True, "rests": True, "steps": 8}, 1),
+        ({"cuda": False, "particles": 10, "heat": True, "rests": True, "steps": 7}, 0),
     ],
 )
 def test_order_of_particles(changes, order):

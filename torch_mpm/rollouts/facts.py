@@ -61,6 +61,7 @@ class Facts(NamedTuple):
     path_bytes: int
     obstacles: int
     heat: bool
+    rests: bool
     bodies: bool
 
 
@@ -72,7 +73,7 @@ def facts_of(steps: Steps, state: State, stores_all: bool = False) -> Facts:
     records = gradients and stores_all and state.impulse is None and len(state) > 0
     of_paths = path_bytes(step, steps, state)
     if not x.is_cuda:
-        return _facts_on_cpu(len(state), steps.n, state.ids is not None, gradients, records, of_paths)
+        return _facts_on_cpu(len(state), steps.n, state.ids is not None, gradients, records, of_paths, step._rests)
     grid, law = step.grid, step.law
     laws, moved = laws_of(law), law.state_fields
     return Facts(
@@ -107,18 +108,19 @@ def facts_of(steps: Steps, state: State, stores_all: bool = False) -> Facts:
         of_paths,
         len(_obstacles(step)),
         step.heat is not None,
+        step._rests,
         steps.bodies is not None,
     )
 
 
 @functools.lru_cache(maxsize=1024)
 def _facts_on_cpu(
-    particles: int, steps: int, is_sorted: bool, gradients: bool, records: bool, path_bytes: int
+    particles: int, steps: int, is_sorted: bool, gradients: bool, records: bool, path_bytes: int, rests: bool
 ) -> Facts:
     """Facts of steps on the CPU, whose schedules and order of particles depend on no others."""
     none = Facts(*[False] * len(Facts._fields))
     none = none._replace(particles=particles, steps=steps, sorted=is_sorted)
-    return none._replace(gradients=gradients, records=records, path_bytes=path_bytes)
+    return none._replace(gradients=gradients, records=records, path_bytes=path_bytes, rests=rests)
 
 
 def _is_uniform(law: Any) -> bool:

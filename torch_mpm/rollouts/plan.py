@@ -217,10 +217,6 @@ def _checkpoints_that_fit(steps: Steps, state: State, fused: bool) -> Checkpoint
     return within_budget(steps, state, fused)
 
 
-LEAST_STEPS_IN_ORDER, LEAST_PARTICLES_IN_ORDER = 8, 1 << 18
-"""Number of steps of a body at rest for which it pays to sort its particles, on CUDA only if they are that many: there
-a step of a million in any order takes 670 us, in order 220, and sorting 450 (H200). The op reorders those of a body in
-motion."""
 _INSTEAD = {name: "the op computes all steps" for name in ("replay", "graph", "loop")}
 
 
@@ -228,24 +224,15 @@ def _fused(steps: Steps, state: State, checkpoints: Checkpoints | None) -> Rollo
     """The plan for the fused op."""
     facts = facts_of(steps, state, checkpoints is EVERYTHING)
     plan = _planned(steps.schedule, facts)
-    step, steps_per_call = steps.step, plan.steps_per_call
-    assert isinstance(step, Step)
-    if step._rests and _pays_in_order(facts):
-        plan = dataclasses.replace(plan, sorts=True)
     if checkpoints is None and not facts.gradients:
         return plan
+    step, steps_per_call = steps.step, plan.steps_per_call
+    assert isinstance(step, Step)
     if facts.gradients and checkpoints is not EVERYTHING:
         checkpoints = None if checkpoints is None else with_parts(checkpoints, step, state, steps.n)
         every = None if checkpoints is None else checkpoints.every
         steps_per_call = min(steps_per_call, every or steps_of_a_call(step, state, steps.n))
     return dataclasses.replace(plan, steps_per_call=steps_per_call, checkpoints=checkpoints)
-
-
-def _pays_in_order(facts: Facts) -> bool:
-    """Whether it pays to sort the particles of a body at rest."""
-    if facts.gradients or facts.sorted or facts.captured or facts.steps < LEAST_STEPS_IN_ORDER:
-        return False
-    return not facts.cuda or facts.particles >= LEAST_PARTICLES_IN_ORDER
 
 
 @functools.lru_cache(maxsize=1024)
